@@ -16,8 +16,8 @@ measured one, whitened.
 
 import numpy as np
 
-from factors._kernels import tangent_axes
 from factors.compiled import kernel_and_part
+from factors.kernel_parts import invert_symmetric, rig_vector, tangent_axes, times_symmetric
 from factors.robust import rho_and_weight
 
 _EPS = 1e-300  # guards divisions by a squared norm
@@ -201,9 +201,8 @@ def _look(
     tau, centre, motion, axes, inverse_radius, X, pose, turn, d, q, e, origin, away, n, moved
 ):  # fmt: skip
     """Write where a point is: d, e, the lens's o and n, l = e - o, and Q and s w."""
-    x, y, z = X[0] - pose[9], X[1] - pose[10], X[2] - pose[11]
+    d[0], d[1], d[2] = rig_vector(pose, X)
     for i in range(3):
-        d[i] = pose[i] * x + pose[3 + i] * y + pose[6 + i] * z
         moved[i], q[i] = tau * motion[i], d[i] - tau * motion[3 + i]
     _set_rotation(moved[0], moved[1], moved[2], turn)
     _times_transposed(turn, q, e)
@@ -340,23 +339,6 @@ def _add_normal(normal, residual, by_point, weight):
 
 
 @_part
-def _step_of(normal, damping):
-    """Gauss-Newton step of a landmark, negated, damped by part of its Hessian's trace."""
-    eps = (1e-12 + damping) * (normal[0] + normal[3] + normal[5]) + 1e-200
-    a, b, c, d = normal[0] + eps, normal[1], normal[2], normal[3] + eps
-    l00 = np.sqrt(a)
-    l10, l20 = b / l00, c / l00
-    l11 = np.sqrt(max(d - l10 * l10, eps))
-    l21 = (normal[4] - l10 * l20) / l11
-    l22 = np.sqrt(max(normal[5] + eps - l20 * l20 - l21 * l21, eps))
-    x = normal[6] / l00
-    y = (normal[7] - l10 * x) / l11
-    z = (normal[8] - l20 * x - l21 * y) / (l22 * l22)
-    y = (y - l21 * z) / l11
-    return (x - l10 * y - l20 * z) / l00, y, z
-
-
-@_part
 def _substitute(
     j, sightings, camera, columns, X, poses, own_steps, shared_steps, loss, scale, scratch, rows,
     normal, out,
@@ -378,7 +360,7 @@ def _substitute(
             for k in range(len(shared_steps)):
                 residual[r] += by_shared[r, k] * shared_steps[k]
         _add_normal(normal, residual, by_point, weight)
-    x, y, z = _step_of(normal, 0.0)
+    x, y, z = times_symmetric(invert_symmetric(normal, 0.0), normal[6], normal[7], normal[8])
     out[0], out[1], out[2] = X[0] - x, X[1] - y, X[2] - z
 
 
@@ -433,7 +415,8 @@ def polish_range(
                 if not cost <= point_costs[j]:
                     there[:] = points[j]
                     continue
-            x, y, z = _step_of(normal, damping)
+            inverse = invert_symmetric(normal, damping)
+            x, y, z = times_symmetric(inverse, normal[6], normal[7], normal[8])
             gain = 0.5 * (x * normal[6] + y * normal[7] + z * normal[8])
             if steps == num_steps or not gain > tolerance * cost:
                 break

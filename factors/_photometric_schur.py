@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from factors._kernels import invert_symmetric, rig_vector
 from factors.compiled import kernel_and_part
+from factors.kernel_parts import invert_symmetric, rig_vector
 
 _kernel, _part = kernel_and_part(fastmath={"contract"})
 _, _allocating = kernel_and_part(allocating=True, fastmath={"contract"})

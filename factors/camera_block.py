@@ -8,16 +8,12 @@ import numpy as np
 from factors._camera_kernels import polish_range, see_range
 from factors._observations import covisible_pairs
 from factors._terms import pose_rows
-from factors.bearing import tangent_basis
 from factors.block import Block, PoseSystem
 from factors.camera_rows import (
     DIM,
     CameraRows,
     CameraVariables,
-    Columns,
     LensSightings,
-    LensVariables,
-    lens_sizes,
 )
 from factors.elimination import Eliminated
 from factors.robust import RobustLoss
@@ -84,9 +80,6 @@ class CameraBlock(Block):
     def points_world(self) -> np.ndarray:
         """(J, 3) float64, current landmarks."""
         return self._points.copy()
-
-    def refresh(self, values: gtsam.Values) -> None:
-        """Nothing depends on accepted values here."""
 
     def linearize(self, values: gtsam.Values) -> PoseSystem:
         """Second-order model at `values`: robust weights, landmarks eliminated."""
@@ -244,32 +237,3 @@ def sightings_of(
     kinds: Sequence[type] = (np.int64, np.int64, float, float, np.int64, float)
     sorted_ = [np.asarray(row)[order].astype(kind) for row, kind in zip(rows, kinds, strict=True)]
     return LensSightings(offsets, *sorted_), order
-
-
-def pixels_of(
-    directions: np.ndarray, lenses: np.ndarray, calibration: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (O, 3) that raw lenses (O,) show unit directions (O, 3), rig frame, in, as
-    `LensSightings` has them, and how these move, on their tangent_basis, with the pixels
-    (O, 2, 2); calibration (L, 16) as in `CameraRows`."""
-    num = len(directions)
-    frames, rows = np.zeros(num, np.int64), np.arange(num)
-    plain = np.zeros((num, 3)), np.tile(np.eye(2), (num, 1, 1)), lenses, np.zeros(num)
-    sightings, _ = sightings_of(frames, rows, num, *plain)
-    many, free = len(calibration), 3 * (len(calibration) - 1)
-    width = free + sum(lens_sizes(many))
-    camera = CameraRows(
-        np.zeros((1, 6)), np.zeros((1, 6)), np.eye(3)[None], np.zeros((many, 1, 3, 3)),
-        np.zeros((many, 3)), np.zeros(many), np.zeros(width), np.ascontiguousarray(calibration),
-        np.ones((many, 7)), np.tile(np.eye(3), (many, 1, 1)),
-    )  # fmt: skip
-    pose, residuals = np.array([[*np.eye(3).ravel(), 0, 0, 0]]), np.empty((num, 2))
-    by_direction, unused = np.empty((num, 2, 3)), np.empty((num, 2, width))
-    plain = LensVariables(range(many - 1), lenses=range(3 * many - 1), calibration=calibration)
-    columns = Columns(*(part.astype(np.int64) for part in plain.columns(-1, -1, 0, 0)))
-    see_range(
-        0, num, sightings, camera, columns, np.ascontiguousarray(directions), pose, residuals,
-        by_direction, unused, unused,
-    )  # fmt: skip
-    along = by_direction @ np.swapaxes(tangent_basis(directions), 1, 2)
-    return np.column_stack([residuals, np.zeros(num)]), np.linalg.inv(along)

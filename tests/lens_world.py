@@ -88,7 +88,7 @@ def solved_with(
     tracks = estimates.cameras.clear(world.tracks, estimates.cameras.seen(shown))
     given = estimates, times(len(start.world_T_rigs)), start, problem
     solved, found = solve_with_camera(tracks, shown, *given, (30.0, 8.0, 8.0))
-    return solved, found.only
+    return solved, found.each[0]
 
 
 def placed(solved: Solution, keypoints: Keypoints, tracks: Tracks) -> Landmarks:

@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from gsba.app.progress import Progress
+from gsba.bundle.found_camera import FoundCamera
 from gsba.bundle.lens_centres import LensCentres
 from gsba.bundle.readout import CameraEstimate
 from gsba.config import CameraSettings
@@ -91,8 +92,8 @@ def camera_so_far(run: Path, done: Sequence[str]) -> list[str]:
     if centres is None:
         return []
     readout = _latest(run, done, READOUTS, CameraEstimate)
-    nothing = (None, None, None, 1.0, CameraSettings(), True)
-    content, notes = of_camera(centres, readout, *nothing)
+    found = FoundCamera(centres, readout=readout)
+    content, notes = of_camera(found, None, 1.0, CameraSettings(), True)
     return notes if content["taken"] else [f"two lenses were not found: {content['reason']}"]
 
 

@@ -160,35 +160,28 @@ class CameraSystem:
             self.context.settings.seed,
             beside,
         )
-        sigmas = {
-            key: np.sqrt(np.diagonal(found[num + i])[:dim])
-            for i, (key, dim) in enumerate(unknowns.variables.shared)
+        blocks = {
+            key: block[:dim, :dim]
+            for (key, dim), block in zip(unknowns.variables.shared, found[num:], strict=True)
         }
-        of_centres = {
-            key: found[num + i, :3, :3] for i, (key, _) in enumerate(unknowns.variables.shared)
-        }
-        cameras = [
-            _sigmas_of(variables, sigmas, of_centres) for variables in unknowns.variables.cameras
-        ]
+        cameras = [_sigmas_of(variables, blocks) for variables in unknowns.variables.cameras]
         return CameraCovariances(found[:num], joint, tuple(cameras))
 
 
-def _sigmas_of(
-    variables: LensVariables, sigmas: dict[int, np.ndarray], covariances: dict[int, np.ndarray]
-) -> CameraSigmas:
-    """Covariances of one camera, from standard deviations and covariances of all by their keys."""
-    nothing = np.array([np.nan])
-    readout_sigma, of_radius = (
-        float(sigmas.get(-1 if key is None else key, nothing)[0])
-        for key in (variables.readout, variables.radius)
-    )
-    lenses = None
+def _sigmas_of(variables: LensVariables, covariances: dict[int, np.ndarray]) -> CameraSigmas:
+    """Covariances of one camera, from those of all shared variables by their keys."""
+
+    def sigmas(key: int | None) -> np.ndarray:
+        """Standard deviations of a variable; NaN = there is none."""
+        return np.full(1, np.nan) if key is None else np.sqrt(np.diagonal(covariances[key]))
+
+    lenses, centre = None, np.zeros((0, 0))
     if variables.lenses is not None:
-        lenses = np.concatenate([sigmas[key] for key in variables.lenses])
-    centre = np.zeros((0, 0))
+        lenses = np.concatenate([sigmas(key) for key in variables.lenses])
     if variables.centres:
         centre = np.asarray(block_diag(*(covariances[key] for key in variables.centres)))
-    return CameraSigmas(centre, readout_sigma, of_radius, lenses)
+    of_radius = float(sigmas(variables.radius)[0])
+    return CameraSigmas(centre, float(sigmas(variables.readout)[0]), of_radius, lenses)
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,13 +8,13 @@ from functools import partial
 import gtsam
 import numpy as np
 
-from factors.camera_block import CameraBlock, pixels_of, sightings_of
+from factors.camera_block import CameraBlock, sightings_of
 from factors.camera_rows import CameraVariables, LensVariables, half_baseline, lens_sizes, vector
 from gsba.bundle import lens_axes, readout, self_calibration
 from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.pose_variables import X
 from gsba.bundle.readout import CameraEstimate, CameraEstimates
-from gsba.camera.fisheye import rotation_of
+from gsba.camera.fisheye import by_move, project, rotation_of
 from gsba.config import CameraSettings
 from gsba.types import Keypoints, Landmarks
 
@@ -153,11 +153,14 @@ class CameraUnknowns:
             return directions, roots, np.full(len(frames), first), np.zeros(len(frames))
         seeing = lenses.facing(directions, frames)
         fractions = lenses.fractions(directions, frames)
-        measured, calibration = directions, variables.calibration
-        if calibration is not None:
-            measured, by_pixel = pixels_of(directions, seeing, calibration)
-            roots = roots @ by_pixel
-        return measured, roots, first + seeing, fractions
+        if lenses.fisheyes is None:
+            return directions, roots, first + seeing, fractions
+        measured, whiteners = np.zeros_like(directions), np.empty_like(roots)
+        for lens, fisheye in enumerate(lenses.reference_calibration or ()):
+            rows = seeing == lens
+            measured[rows, :2] = project(fisheye, directions[rows])
+            whiteners[rows] = roots[rows] @ np.linalg.inv(by_move(fisheye, directions[rows]))
+        return measured, whiteners, first + seeing, fractions
 
     def spread_as(self, sigmas: Sequence[np.ndarray]) -> "CameraUnknowns":
         """The unknowns with other standard deviations (C) of (6,) of frames' own motion."""

@@ -8,11 +8,11 @@ from functools import partial
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from factors.bearing import tangent_basis
 from gsba.bundle.shared_parameters import (
     PARTS,
     ObservedRays,
     Weighted,
-    by_origin,
     cross_validate,
     frame_models,
     models_of,
@@ -84,7 +84,8 @@ def loosened(rays: ObservedRays) -> LensAxes:
     def by_axes(seen: Weighted) -> np.ndarray:
         there, bearings = frames[seen.rows], keypoints.bearings_rig[seen.rows]
         rotations = solved.world_T_rigs[there, :3, :3]
-        by_start = by_origin(seen, rotations, bearings, so_far.inverse_stitch_radius)
+        by_start = -seen.by_point @ rotations
+        by_start = by_start + so_far.inverse_stitch_radius * tangent_basis(bearings)
         return so_far.by_centre(by_start, bearings, there) @ by_turn(so_far)
 
     models = frame_models(used, by_axes)

@@ -15,11 +15,11 @@ from gsba.bundle.shared_parameters import (
     ObservedRays,
     SharedModel,
     cross_validate,
-    model_of,
     models_of,
     newton_step,
     predicts,
     summed,
+    whole_model,
 )
 from gsba.camera.lens import Lenses
 from gsba.types import Counts
@@ -81,17 +81,14 @@ def estimate(rays: ObservedRays) -> LensCentres:
         return so_far.by_centre(by_origin, keypoints.bearings_rig[rows], frames[rows])
 
     systems, counts = models_of(rays, by_centre)
-    whole, used = None, rays.drawn
-    some = used.solved.landmarks.tracks.num_points
     # raw pairs have two lenses, even where frames are few
-    if not systems and so_far.reference_calibration is not None and some:
-        whole = model_of(used, by_centre)
-    if not systems and whole is None:
+    raw = so_far.reference_calibration is not None
+    total = whole_model(rays, systems, by_centre) if systems or raw else None
+    if total is None:
         num = len(so_far.centre)
         unknown, nothing = np.full((num, num), np.nan), np.full(PARTS, np.nan)
         why = "too few points to tell one lens from the other"
         return LensCentres(so_far, so_far.centre, unknown, nothing, why, counts)
-    total = whole or summed(systems)
     damping = 1e-9 * np.trace(total.hessian) * np.eye(len(total.hessian))
     covariance = np.linalg.inv(total.hessian + damping) / total.curvature
     found = so_far.centre + _step([total])
@@ -101,7 +98,7 @@ def estimate(rays: ObservedRays) -> LensCentres:
     shares = verdict.shares if systems else np.full(PARTS, np.nan)
     strength = float(np.sqrt(found @ np.linalg.solve(covariance, found)))
     reason = ""
-    if chosen.model == "auto" and so_far.reference_calibration is None:  # raw pairs have two lenses
+    if chosen.model == "auto" and not raw:
         # Matches that one centre has chosen hide the lenses from some parts of the sequence.
         if not (verdict.predicts if so_far else gains.sum() > 0):
             reason = "it does not predict parts of the sequence that it was not found from"

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from factors.compiled import kernel_and_part
+from factors.kernel_parts import invert_symmetric, tangent_axes, times_symmetric
 from gsba.bundle.tracks import map_runs
 from gsba.disk import concatenated
 from gsba.memory import release_mapped_files
@@ -53,7 +54,7 @@ def _standardize(j, starts, points, frames, poses, bearings, roots, origins, row
         normal[3] += a1 * a1 + b1 * b1
         normal[4] += a1 * a2 + b1 * b2
         normal[5] += a2 * a2 + b2 * b2
-    covariance = _inverse(normal)
+    covariance = invert_symmetric(normal, 0.0)  # as depth may be unknown
     for o in range(starts[j], starts[j + 1]):
         out[o] = _along(rows[o - starts[j]], covariance)
 
@@ -67,12 +68,7 @@ def _by_point(o, point, pose, bearings, roots, origins, row):
     dz = pose[0, 2] * x + pose[1, 2] * y + pose[2, 2] * z
     if len(origins):
         dx, dy, dz = dx - origins[o, 0], dy - origins[o, 1], dz - origins[o, 2]
-    mx, my, mz = bearings[o, 0], bearings[o, 1], bearings[o, 2]
-    sign = 1.0 if mz >= 0 else -1.0  # axes of factors.tangent_basis
-    a = -1.0 / (sign + mz)
-    b = mx * my * a
-    u0, u1, u2 = 1.0 + sign * mx * mx * a, sign * b, -sign * mx
-    v0, v1, v2 = b, sign + my * my * a, -my
+    u0, u1, u2, v0, v1, v2 = tangent_axes(bearings[o, 0], bearings[o, 1], bearings[o, 2])
     distance = np.sqrt(dx * dx + dy * dy + dz * dz)
     for i in range(2):
         s, t = roots[o, i, 0], roots[o, i, 1]
@@ -84,33 +80,9 @@ def _by_point(o, point, pose, bearings, roots, origins, row):
 
 
 @_part
-def _inverse(normal):
-    """Inverse (00 01 02 11 12 22) of a symmetric 3x3 in this form, its diagonal raised a little."""
-    added = 1e-12 * (normal[0] + normal[3] + normal[5]) + 2.3e-308  # as depth may be unknown
-    a, b, c = normal[0] + added, normal[1], normal[2]
-    d, e, f = normal[3] + added, normal[4], normal[5] + added
-    l00 = np.sqrt(a)
-    l10, l20 = b / l00, c / l00
-    l11 = np.sqrt(max(d - l10 * l10, added))
-    l21 = (e - l10 * l20) / l11
-    l22 = np.sqrt(max(f - l20 * l20 - l21 * l21, added))
-    i00, i11, i22 = 1 / l00, 1 / l11, 1 / l22
-    i10, i21 = -l10 * i00 * i11, -l21 * i11 * i22
-    i20 = -(l20 * i00 + l21 * i10) * i22
-    return (
-        i00 * i00 + i10 * i10 + i20 * i20, i10 * i11 + i20 * i21, i20 * i22,
-        i11 * i11 + i21 * i21, i21 * i22, i22 * i22,
-    )  # fmt: skip
-
-
-@_part
 def _product(row, i, k, covariance):
     """Rows i and k of a Jacobian, about the covariance of its point."""
-    c00, c01, c02, c11, c12, c22 = covariance
-    x, y, z = row[2 + 3 * i], row[3 + 3 * i], row[4 + 3 * i]
-    p = c00 * x + c01 * y + c02 * z
-    q = c01 * x + c11 * y + c12 * z
-    r = c02 * x + c12 * y + c22 * z
+    p, q, r = times_symmetric(covariance, row[2 + 3 * i], row[3 + 3 * i], row[4 + 3 * i])
     return p * row[2 + 3 * k] + q * row[3 + 3 * k] + r * row[4 + 3 * k]
 
 
@@ -158,11 +130,8 @@ def _face_root(o, bearings, axes, faces, sigmas, out):
     ax, ay, az = axes[faces[o], 0], axes[faces[o], 1], axes[faces[o], 2]
     cosine = mx * ax + my * ay + mz * az
     x, y, z = cosine * mx - ax, cosine * my - ay, cosine * mz - az  # away from the axis
-    sign = 1.0 if mz >= 0 else -1.0  # axes of factors.tangent_basis
-    a = -1.0 / (sign + mz)
-    b = mx * my * a
-    s = (1.0 + sign * mx * mx * a) * x + sign * b * y - sign * mx * z
-    t = b * x + (sign + my * my * a) * y - my * z
+    u0, u1, u2, v0, v1, v2 = tangent_axes(mx, my, mz)
+    s, t = u0 * x + u1 * y + u2 * z, v0 * x + v1 * y + v2 * z
     length = max(np.sqrt(s * s + t * t), _MIN_LENGTH)
     s, t = s / length, t / length
     root = np.sqrt(min(max(cosine, _MIN_COSINE), 1.0))

@@ -4,6 +4,7 @@
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import product
 
 import numpy as np
@@ -12,9 +13,9 @@ from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.shared_parameters import (
     PARTS,
     ObservedRays,
-    SharedModel,
     cross_validate,
     models_of,
+    newton_step,
     predicts,
     summed,
 )
@@ -81,7 +82,8 @@ def estimate(rays: ObservedRays) -> CameraEstimate:
     if not systems:
         return CameraEstimate(lenses, reason="too few points to tell rows apart", counts=counts)
     of_ways = [[part.of(slice(way, way + 1)) for part in systems] for way in range(len(ways))]
-    verdicts = [cross_validate(parts, _newton_step) for parts in of_ways]
+    durations = partial(newton_step, curved=False)  # (1,) by some parts
+    verdicts = [cross_validate(parts, durations) for parts in of_ways]
     best = int(np.argmax([verdict.gains.sum() for verdict in verdicts]))
     total = summed(of_ways[best])
     curved = max(float(total.hessian[0, 0]), 1e-300)
@@ -172,12 +174,6 @@ def velocities(
     return np.hstack([rates, local / span])
 
 
-def _newton_step(parts: Sequence[SharedModel]) -> np.ndarray:
-    """Duration (1,) by these parts for one row direction, the loss's curvature left out."""
-    total = summed(parts)
-    return -total.gradient / np.maximum(total.hessian[0], 1e-300)
-
-
 def _ways(camera: CameraSettings, lenses: Lenses) -> list[np.ndarray]:
     """Row directions (L, 3) that lenses may have, up to all of them reversed."""
     num = lenses.num_lenses
@@ -203,32 +199,16 @@ class CameraEstimates:
     each: tuple[CameraEstimate, ...]  # (C,)
     of_frame: tuple[int, ...] = ()  # (F,) as in `Cameras`
 
-    @classmethod
-    def of(cls, cameras: Cameras) -> "CameraEstimates":
-        """Cameras of which lenses alone are known."""
-        return cls(tuple(CameraEstimate(lenses) for lenses in cameras.lenses), cameras.of_frame)
-
     @property
     def cameras(self) -> Cameras:
         """The lenses of each camera."""
         return Cameras(tuple(one.lenses for one in self.each), self.of_frame)
-
-    @property
-    def only(self) -> CameraEstimate:
-        """The estimate of a single camera. ValueError: there are several cameras."""
-        (found,) = self.each
-        return found
 
     def with_each(self, each: Sequence[CameraEstimate]) -> "CameraEstimates":
         """Other estimates (C,) of the cameras that took these frames."""
         if len(each) != len(self.each):
             raise ValueError(f"estimates of {len(each)} cameras instead of {len(self.each)}")
         return replace(self, each=tuple(each))
-
-    def with_lenses(self, lenses: Sequence[Lenses]) -> "CameraEstimates":
-        """The estimates with other lenses (C,)."""
-        pairs = zip(self.each, lenses, strict=True)
-        return self.with_each([replace(one, lenses=own) for one, own in pairs])
 
     def changed(self, camera: int, found: CameraEstimate) -> "CameraEstimates":
         """The estimates with another one of one camera."""

@@ -16,10 +16,10 @@ from gsba.bundle.shared_parameters import (
     ObservedRays,
     SharedModel,
     cross_validate,
-    model_of,
     models_of,
     newton_step,
     summed,
+    whole_model,
 )
 from gsba.camera.fisheye import PARAMETERS, Rig, by_parameters, changed, difference, recalibrated
 from gsba.camera.lens import Lenses
@@ -64,10 +64,7 @@ def estimate(rays: ObservedRays, nominal: bool = False) -> SelfCalibration:
     systems, counts = models_of(rays, by_both)
     off = from_calibrated(so_far)
     if nominal:
-        whole = summed(systems) if systems else None
-        used = rays.drawn
-        if whole is None and used.solved.landmarks.tracks.num_points:
-            whole = model_of(used, by_both)
+        whole = whole_model(rays, systems, by_both)
         if whole is not None:
             return _of_nominal(whole, so_far, off, counts)
     if not systems:

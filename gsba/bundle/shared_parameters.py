@@ -11,7 +11,7 @@ import numpy as np
 from scipy.sparse import diags_array as diags
 from scipy.sparse.linalg import splu
 
-from factors.bearing import bearing_residuals, tangent_basis
+from factors.bearing import bearing_residuals
 from factors.cholesky import BlockCholesky
 from factors.elimination import Eliminated, LinearSystem, eliminate
 from factors.robust import RobustLoss
@@ -190,8 +190,13 @@ def weighted_at(
 def models_of(
     rays: ObservedRays, by_shared: BySharedParameters
 ) -> tuple[list[SharedModel], Counts]:
-    """Models of the cost of each part of the sequence, see `model_of`, none where there is too
-    little; and how many observations they rest on."""
+    """Models of the robust cost of each part of the sequence, none where there is too little; and
+    how many observations they rest on.
+
+    Points are moved to their best first, poses are those of a solution; by_shared: Jacobian (O, 2,
+    K) of bearings' residuals, from the rows (O,) of keypoints, the Jacobian (O, 2, 3) by where each
+    ray starts, and the residuals (O, 2).
+    """
 
     def model(part: tuple[Tracks, Once[Weighted]]) -> SharedModel:
         tracks, seen = part
@@ -202,12 +207,18 @@ def models_of(
     return models, sample_counts(rays.solved.landmarks, rays.drawn.solved.landmarks)
 
 
-def model_of(rays: ObservedRays, by_shared: BySharedParameters) -> SharedModel:
-    """Model of the robust cost of points, moved to their best first, and their bearings, at a
-    solution's poses; by_shared: Jacobian (O, 2, K) of bearings' residuals, from the rows (O,) of
-    keypoints, the Jacobian (O, 2, 3) by where each ray starts, and the residuals (O, 2)."""
-    solved = rays.solved
-    return _model(weighted(rays), solved.landmarks.tracks, solved.world_T_rigs, by_shared)
+def whole_model(
+    rays: ObservedRays, models: Sequence[SharedModel], by_shared: BySharedParameters
+) -> SharedModel | None:
+    """The sum of the models of parts, or where there is too little for parts, the model of all
+    points; None = there are none."""
+    if models:
+        return summed(models)
+    solved = rays.drawn.solved
+    tracks = solved.landmarks.tracks
+    if not tracks.num_points:
+        return None
+    return _model(weighted(rays.drawn), tracks, solved.world_T_rigs, by_shared)
 
 
 def _model(
@@ -249,14 +260,6 @@ def without_points(
     return eliminate(
         num_frames, tracks.frames, tracks.points, residuals, of_point, of_frame, shared
     )
-
-
-def by_origin(
-    seen: Weighted, world_R_rigs: np.ndarray, bearings_rig: np.ndarray, inverse_stitch_radius: float
-) -> np.ndarray:
-    """Jacobian (O, 2, 3) of residuals by the origin of rays, rig frame, and by their direction, of
-    rays (O, 3) of poses turned by (O, 3, 3); for inverse_stitch_radius see `Lenses`."""
-    return -seen.by_point @ world_R_rigs + inverse_stitch_radius * tangent_basis(bearings_rig)
 
 
 _MIN_GAIN_SIGMAS = 3.0  # least significant gain, in its standard deviations

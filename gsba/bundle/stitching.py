@@ -136,7 +136,7 @@ def _systems(
 
 
 def _by_field(keypoints: Keypoints, there: Keypoints, max_degree: int) -> BySharedParameters:
-    """Jacobian of residuals by a field, as in `model_of`, where it takes keypoints to `there`."""
+    """Jacobian of residuals by a field, as in `models_of`, where it takes keypoints to `there`."""
 
     def by_field(rows: np.ndarray, _origin: np.ndarray, _residuals: np.ndarray) -> np.ndarray:
         basis = harmonics(keypoints.bearings_rig[rows], max_degree)

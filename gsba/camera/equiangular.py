@@ -6,6 +6,9 @@ square is as high as its track, and equal steps in it are equal angles from its 
 half of the front and half of the back lens: their middle columns stand twice, once from each lens,
 so that they are wider than high. A track is 3 S + 2 overlap wide: its size gives the overlap.
 
+Flat squares, pinhole faces of 90 degrees, are looked up in the same way: equal steps in them are
+equal steps of x / z.
+
 Source of the layout: P. Bourke, paulbourke.net/panorama/gopromax2sphere (2021). The turns, the
 overlap and the angles were checked on frames of a MAX at 3K and panoramas made of them.
 """
@@ -29,15 +32,6 @@ _AXES = RIG_R_FACE[:, :, :2]  # (6, 3, 2), right and down of each face
 _AXIS_OF, _SIGN_OF = np.abs(_AXES).argmax(axis=1), _AXES.sum(axis=1)  # (6, 2) each
 
 
-@dataclass(frozen=True, slots=True)
-class Taps:
-    """The pixels of two tracks that show directions: one each, or two where lenses are blended."""
-
-    tracks: np.ndarray  # (...) int, 0 or 1
-    pixels: np.ndarray  # (..., 2, 2) float64, of both taps in that track, corner origin
-    weights: np.ndarray  # (..., 2) float64, in [0, 1], of sum 1
-
-
 def is_equiangular(width: int, height: int) -> bool:
     """True if one of two tracks can have this size, pixels."""
     extra = width - 3 * height
@@ -51,40 +45,29 @@ def overlap_of(width: int, height: int) -> int:
     return (width - 3 * height) // 2
 
 
-def square_pixels(directions: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
+def square_pixels(
+    directions: np.ndarray, size: int, flat: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
     """Pixels of directions (..., 3), rig frame, of any length, in upright equi-angular squares of
-    `size` pixels: (...) uint8, indices into FACES, and (..., 2) float64 pixels, corner origin."""
+    `size` pixels, or flat ones: pinhole faces of 90 degrees. Returns (...) uint8, indices into
+    FACES, and (..., 2) float64 pixels, corner origin."""
     magnitudes = np.abs(directions)
     axis = np.argmax(magnitudes, axis=-1)[..., None]
     along = np.take_along_axis(directions, axis, axis=-1)
     faces = _FACE_ALONG[axis, (along < 0).astype(int)][..., 0]
-    angles = np.arctan(directions / np.maximum(np.abs(along), 1e-300)) / (np.pi / 2)
-    across = np.take_along_axis(angles, _AXIS_OF[faces], axis=-1) * _SIGN_OF[faces]
+    slopes = directions / np.maximum(np.abs(along), 1e-300)
+    steps = slopes / 2 if flat else np.arctan(slopes) / (np.pi / 2)
+    across = np.take_along_axis(steps, _AXIS_OF[faces], axis=-1) * _SIGN_OF[faces]
     return faces.astype(np.uint8), (across + 0.5) * size
 
 
-def square_directions(pixels: np.ndarray, face: int, size: int) -> np.ndarray:
-    """Directions (..., 3), rig frame, of pixels (..., 2) of an upright equi-angular square or less
-    than an eighth of it beyond its border."""
-    across = np.tan((pixels / size - 0.5) * (np.pi / 2))
+def square_directions(pixels: np.ndarray, face: int, size: int, flat: bool = False) -> np.ndarray:
+    """Directions (..., 3), rig frame, of pixels (..., 2) of an upright equi-angular or flat square
+    or less than an eighth of it beyond its border."""
+    steps = pixels / size - 0.5
+    across = 2 * steps if flat else np.tan(steps * (np.pi / 2))
     local = np.concatenate([across, np.ones_like(across[..., :1])], axis=-1)
     return local @ RIG_R_FACE[face].T
-
-
-def taps(directions: np.ndarray, width: int, height: int) -> Taps:
-    """The pixels by which two tracks of a size, pixels, show directions (..., 3), rig frame."""
-    faces, pixels = square_pixels(directions, height)
-    track, slot, turns = np.moveaxis(np.array(_STORED)[faces], -1, 0)
-    u, v = pixels[..., 0], pixels[..., 1]
-    stored_u = np.select([turns == 0, turns > 0], [u, height - v], v)
-    stored_v = np.select([turns == 0, turns > 0], [v, u], height - u)
-    overlap = overlap_of(width, height)
-    share = np.where(slot == 1, 1.0, _left_share(stored_u, height, overlap))
-    starts = np.array([0, height + overlap, 2 * height + overlap])[slot]
-    of_left = np.stack([starts + stored_u, stored_v], axis=-1)
-    of_right = of_left + np.where(slot == 1, 0, overlap)[..., None] * [1, 0]
-    both = np.stack([of_left, of_right], axis=-2)
-    return Taps(track, both, np.stack([share, 1 - share], axis=-1))
 
 
 def squares(tracks: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
@@ -108,9 +91,9 @@ def shrunk(faces: np.ndarray, size: int) -> np.ndarray:
     return np.stack([cv2.resize(f, (size, size), interpolation=cv2.INTER_AREA) for f in faces])
 
 
-def around_squares(faces: np.ndarray) -> np.ndarray:
-    """Join squares (6, S, S[, C]) in one picture, three beside three, for `Grid` to look up; each
-    gets PAD pixels of what lies beyond its border on the sphere."""
+def around_squares(faces: np.ndarray, flat: bool = False) -> np.ndarray:
+    """Join equi-angular or flat squares (6, S, S[, C]) in one picture, three beside three, for
+    `Grid` to look up; each gets PAD pixels of what lies beyond its border on the sphere."""
     size = faces.shape[1]
     cell = size + 2 * PAD
     out = np.empty((2 * cell, 3 * cell, *faces.shape[3:]), faces.dtype)
@@ -118,7 +101,7 @@ def around_squares(faces: np.ndarray) -> np.ndarray:
         top, left = cell * (n // 3), cell * (n % 3)
         padded = cv2.copyMakeBorder(face, PAD, PAD, PAD, PAD, cv2.BORDER_REPLICATE)
         out[top : top + cell, left : left + cell] = padded
-    rows, columns, maps = _borders(size)
+    rows, columns, maps = _borders(size, flat)
     out[rows, columns] = cv2.remap(out, maps[0], maps[1], cv2.INTER_CUBIC)
     return out
 
@@ -129,12 +112,13 @@ class Grid:
 
     size: int  # pixels across a square
     correction: tuple[float, ...] = ()  # coefficients of the stitching field, see `FrameSet`
+    flat: bool = False  # True = squares are pinhole faces
 
     def places(self, directions: np.ndarray) -> np.ndarray:
         """OpenCV pixels (..., 2) float64 of directions (..., 3), rig frame."""
         if self.correction:
             directions = observed(directions, self.correction)
-        faces, pixels = square_pixels(directions, self.size)
+        faces, pixels = square_pixels(directions, self.size, self.flat)
         corners = np.stack([faces % 3, faces // 3], axis=-1) * (self.size + 2.0 * PAD)
         return pixels + corners + (PAD - 0.5)
 
@@ -157,14 +141,14 @@ def _left_share(columns: np.ndarray, size: int, overlap: int) -> np.ndarray:
 
 
 @table(maxsize=4)
-def _borders(size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _borders(size: int, flat: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rows and columns (n, k) of a grid's padding, and OpenCV pixels (2, n, k) of its source."""
-    cell, grid = size + 2 * PAD, Grid(size)
+    cell, grid = size + 2 * PAD, Grid(size, flat=flat)
     ring = np.ones((cell, cell), bool)
     ring[PAD:-PAD, PAD:-PAD] = False
     v, u = np.nonzero(ring)
     pixels = np.stack([u, v], axis=-1) + (0.5 - PAD)
-    places = [grid.places(square_directions(pixels, n, size)) for n in range(len(FACES))]
+    places = [grid.places(square_directions(pixels, n, size, flat)) for n in range(len(FACES))]
     rows = np.stack([v + cell * (n // 3) for n in range(len(FACES))])
     columns = np.stack([u + cell * (n % 3) for n in range(len(FACES))])
     maps = np.moveaxis(np.stack(places), -1, 0).astype(np.float32)

@@ -59,13 +59,20 @@ def unproject(lens: Fisheye, pixels: np.ndarray) -> np.ndarray:
     return projection_of(lens).unproject(pixels) @ rotation_of(lens).T
 
 
+def by_move(lens: Fisheye, directions: np.ndarray) -> np.ndarray:
+    """Jacobian (N, 2, 2) of pixels by moves of unit directions (N, 3), rig frame, on their
+    `tangent_basis`."""
+    rig_R_lens = rotation_of(lens)
+    by_local, _ = projection_of(lens).jacobians(directions @ rig_R_lens)
+    return by_local @ rig_R_lens.T @ np.swapaxes(tangent_basis(directions), 1, 2)
+
+
 def by_parameters(lens: Fisheye, directions: np.ndarray) -> np.ndarray:
     """Jacobians (N, 3, PARAMETERS) of the directions of fixed pixels, (N, 3) unit, rig frame, by
     the lens's parameters."""
-    rig_R_lens = rotation_of(lens)
-    by_local, by_own = projection_of(lens).jacobians(directions @ rig_R_lens)
+    _, by_own = projection_of(lens).jacobians(directions @ rotation_of(lens))
     basis = tangent_basis(directions)  # (N, 2, 3) float64: a unit direction moves on it only
-    moves = -np.linalg.solve(by_local @ rig_R_lens.T @ np.swapaxes(basis, 1, 2), by_own)
+    moves = -np.linalg.solve(by_move(lens, directions), by_own)
     out = np.zeros((len(directions), 3, 3))
     x, y, z = directions.T
     out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = -z, y, -x

@@ -12,7 +12,7 @@ import numpy as np
 
 from gsba.camera.fisheye import facing
 from gsba.camera.lens import Lenses
-from gsba.camera.pictures import Picture, cube_map, lens_picture, panorama
+from gsba.camera.pictures import Picture, panorama
 from gsba.camera.sphere import around_sphere, erp_bands, erp_directions
 from gsba.camera.straighten import PAD
 from gsba.camera.views import FAR_DEPTH, depths_along, observed_points
@@ -41,37 +41,19 @@ class Stitcher:
             offsets = (unit(shown) - rays).reshape(grid.shape).astype(np.float32)
             self._offsets.append(around_sphere(offsets, PAD))
 
-    def stitched(self, erp: np.ndarray) -> np.ndarray:
-        """The panorama (H, 2 H, C) uint8, resampled from a stitcher's one of that shape."""
-        pictures = [panorama(erp)] * len(self._offsets)
-        return self._joined(erp.shape[1], pictures, cv2.INTER_LANCZOS4)
-
-    def stitched_squares(
-        self, squares: np.ndarray, correction: tuple[float, ...] = ()
-    ) -> np.ndarray:
-        """The panorama (2 S, 4 S, C) uint8 of an equi-angular cube map (6, S, S, C), FACES order;
-        correction: coefficients of the stitching field, see `FrameSet`."""
-        pictures = [cube_map(squares, correction)] * len(self._offsets)
-        return self._joined(4 * squares.shape[1], pictures, cv2.INTER_LANCZOS4)
+    def stitched(self, pictures: Sequence[Picture], width: int) -> np.ndarray:
+        """The panorama (width / 2, width, C) uint8, resampled from a picture of all directions, or
+        from those (L) of raw lenses."""
+        return self._joined(width, pictures, cv2.INTER_LANCZOS4)
 
     def stitched_mask(self, mask: np.ndarray) -> np.ndarray:
         """The mask (H, 2 H) bool for the resampled panorama, from the mask of a stitcher's panorama
         or of a raw pair: a direction is used where all pixels blended into it are."""
         white = panorama(mask.astype(np.uint8)[..., None] * 255)
-        pictures = [white] * len(self._offsets)
-        return self._joined(mask.shape[1], pictures, cv2.INTER_NEAREST)[..., 0] == 255
-
-    def stitched_raw(self, pictures: list[np.ndarray], width: int) -> np.ndarray:
-        """The panorama (width / 2, width, C) uint8 of all pictures (h, w, C) uint8 of raw
-        lenses."""
-        pair = self._lenses.reference_calibration
-        assert pair is not None
-        of_lenses = [lens_picture(*each) for each in zip(pair, pictures, strict=True)]
-        return self._joined(width, of_lenses, cv2.INTER_LANCZOS4)
+        return self._joined(mask.shape[1], [white], cv2.INTER_NEAREST)[..., 0] == 255
 
     def _joined(self, width: int, pictures: Sequence[Picture], how: int) -> np.ndarray:
-        """The panorama (width / 2, width, C) uint8 joined from the pictures (L) that show what each
-        lens sees."""
+        """`stitched`, by an interpolation of OpenCV."""
         parts, channels = [], pictures[0].image.shape[2]
         for rows, rays in erp_bands(np.arange(width), width):
             joined = np.zeros((*rays.shape[:2], channels), np.float32)
@@ -81,10 +63,11 @@ class Stitcher:
                 places = np.meshgrid(columns + 0.5, np.arange(rows.start, rows.stop) + 0.5)
                 across, down = ((at * scale - 0.5 + PAD).astype(np.float32) for at in places)
                 moved = cv2.remap(self._offsets[lens], across, down, cv2.INTER_CUBIC)
-                part = pictures[lens].sample(rays[:, columns] + moved, how)
-                joined[:, columns] += share[:, columns, None] * part.reshape(
+                picture = pictures[lens if len(pictures) > 1 else 0]
+                part = picture.sample(rays[:, columns] + moved, how).reshape(
                     *moved.shape[:2], channels
                 )
+                joined[:, columns] += share[:, columns, None] * part
             parts.append(np.rint(joined).astype(np.uint8))
         return np.concatenate(parts)
 

@@ -1,5 +1,5 @@
 """Projections: how lenses map directions to pixels in the lens's own axes (x right, y down, z
-ahead), with Jacobians and parameters with priors."""
+ahead), with Jacobians."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -15,15 +15,6 @@ _NUM_NEWTON_STEPS = 8  # enough for angles to converge in double precision
 _MIN_SLOPE = 0.1  # of the radius by the angle, in Newton's steps beyond a polynomial's own range
 
 
-@dataclass(frozen=True, slots=True)
-class Parameter:
-    """A parameter of a camera's component, as a variable of the graph."""
-
-    name: str
-    size: int  # coordinates
-    sigmas: tuple[float, ...]  # (size,) of the prior around the value that is given
-
-
 class Projection(Protocol):
     """Map of one lens from directions in its frame to pixels (u, v), from the picture's corner."""
 
@@ -37,8 +28,9 @@ class Projection(Protocol):
         """Pixels of the picture."""
         ...
 
-    def parameters(self) -> tuple[Parameter, ...]:
-        """Parameters that can be estimated, in the order of `jacobians` and `stepped`."""
+    @property
+    def num_parameters(self) -> int:
+        """K, parameters that can be estimated, in the order of `jacobians` and `stepped`."""
         ...
 
     def project(self, directions: np.ndarray) -> np.ndarray:
@@ -72,7 +64,6 @@ class RadialProjection(ABC):
     principal: tuple[float, float]  # pixels, corner origin
     radial: tuple[float, ...] = ()  # terms of the formula
 
-    radial_sigmas: ClassVar[tuple[float, ...]] = ()  # of the priors on the radial terms
     max_angle: ClassVar[float] = np.pi  # rad from the axis: nothing is seen from there on
 
     @abstractmethod
@@ -84,12 +75,10 @@ class RadialProjection(ABC):
         """Derivatives (N, len(radial)) of `radii` by the radial terms at angles (N,)."""
         return np.zeros((len(angles), 0))
 
-    def parameters(self) -> tuple[Parameter, ...]:
-        """Relative focal length, principal point in focal lengths, radial terms."""
-        found = Parameter("focal", 1, (0.05,)), Parameter("principal", 2, (0.02, 0.02))
-        if not self.radial:
-            return found
-        return *found, Parameter("radial", len(self.radial), self.radial_sigmas)
+    @property
+    def num_parameters(self) -> int:
+        """See `Projection`."""
+        return 3 + len(self.radial)
 
     def project(self, directions: np.ndarray) -> np.ndarray:
         """See `Projection`."""
@@ -156,8 +145,6 @@ class FisheyeProjection(RadialProjection):
     """r = f (th + k1 th^3 + k2 th^5 + k3 th^7 + k4 th^9) (Kannala and Brandt, PAMI 2006); without
     radial terms it is the equidistant lens."""
 
-    radial_sigmas: ClassVar[tuple[float, ...]] = (0.05, 0.02, 0.005, 0.001)
-
     def radii(self, angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """See `RadialProjection`."""
         return _odd_polynomial(angles, self.radial)
@@ -171,7 +158,6 @@ class FisheyeProjection(RadialProjection):
 class PerspectiveProjection(RadialProjection):
     """r = f (t + k1 t^3 + k2 t^5), t = tan th (Brown, Photogrammetric Engineering 1966)."""
 
-    radial_sigmas: ClassVar[tuple[float, ...]] = (0.1, 0.05)
     max_angle: ClassVar[float] = np.pi / 2 - 1e-6
 
     def radii(self, angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -4,26 +4,22 @@ Faces of one lens have its centre, axes of the lenses, and leave out the blended
 as with all rows read in the middle of the exposure, at the depths that map points give.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
 
 from gsba.camera.cameras import Cameras
-from gsba.camera.equiangular import shrunk
 from gsba.camera.lens import Lenses
-from gsba.camera.pictures import Picture, cube_map, lens_picture, padded_panorama, panorama
+from gsba.camera.pictures import Picture, panorama
 from gsba.camera.rig import RIG_R_FACE, CubeRig
-from gsba.camera.sphere import dense_enough, low_passed, pixel_bands
-from gsba.camera.straighten import PAD
+from gsba.camera.sphere import pixel_bands
 from gsba.geometry import pose, unit
 from gsba.log import GsbaError
 from gsba.types import FACES, PictureFormat, Reconstruction
 
 FAR_DEPTH = 1e9  # map units: depth from which both lenses see alike
-_MAX_OVERSAMPLING = 1.5  # largest ratio of a picture's density to a view's: beyond it, detail
-# aliases
 _NODES_ACROSS_FACE = 33  # nodes across a face of the interpolated offsets, which vary over tens of
 # degrees
 
@@ -265,7 +261,7 @@ def observed_points(reconstruction: Reconstruction) -> np.ndarray:
 
 
 class ViewCutter:
-    """Cuts the views of one frame out of panoramas of it."""
+    """Cuts the views of one frame out of pictures of it."""
 
     def __init__(
         self, views: tuple[View, ...], lenses: Lenses, frame: int, scene: np.ndarray | None = None
@@ -276,51 +272,22 @@ class ViewCutter:
         self._views = views
         self._offsets = [_offsets(view, lenses, frame, scene) for view in views]
         self._turn = np.eye(3) if lenses.axes is None else lenses.axes[frame]
-        self._cut_by, self._centres = lenses.reference_calibration, lenses.centres
+        self._centres = lenses.centres
+        self.focal = views[0].focal  # pixels
 
-    def cut(self, erp: np.ndarray) -> list[np.ndarray]:
-        """Images (height, width[, C]) uint8, bicubic, of a panorama (H, 2 H[, C]) uint8."""
-        picture = panorama(low_passed(erp, self._views[0].focal))
-        return list(self._sampled(picture, cv2.INTER_CUBIC))
-
-    def cut_padded(self, padded: np.ndarray) -> Iterator[np.ndarray]:
-        """Images like those of `cut`, one after the other, of a panorama with PAD pixels around
-        it."""
-        inner = padded[PAD:-PAD, PAD:-PAD]
-        small = low_passed(inner, self._views[0].focal)
-        picture = padded_panorama(padded) if small is inner else panorama(small)
-        return self._sampled(picture, cv2.INTER_CUBIC)
-
-    def cut_raw(self, pictures: list[np.ndarray]) -> Iterator[np.ndarray]:
-        """Images like those of `cut_padded`, cut directly from all pictures (h, w[, C]) uint8 of
-        raw lenses."""
-        assert self._cut_by is not None
+    def cut(self, pictures: Sequence[Picture]) -> Iterator[np.ndarray]:
+        """Images (height, width[, C]), bicubic, one after the other, of a picture of all
+        directions, or of those (L) of raw lenses."""
         for view, offsets in zip(self._views, self._offsets, strict=True):
-            number = nearest_lens(view, self._centres)
-            lens, picture = self._cut_by[number], pictures[number]
-            share = min(_MAX_OVERSAMPLING * view.focal / lens.focal, 1.0)
-            if share * _MAX_OVERSAMPLING < 1:
-                how = cv2.INTER_AREA
-                picture = cv2.resize(picture, None, fx=share, fy=share, interpolation=how)
-            yield self._view(view, offsets, lens_picture(lens, picture), cv2.INTER_CUBIC)
-
-    def cut_squares(
-        self, squares: np.ndarray, correction: tuple[float, ...] = ()
-    ) -> Iterator[np.ndarray]:
-        """Images (height, width[, C]) uint8, bicubic, of an equi-angular cube map (6, S, S, C),
-        FACES order; correction: coefficients of the stitching field, see `PictureFormat`."""
-        width = dense_enough(4 * squares.shape[1], self._views[0].focal)
-        squares = shrunk(squares, width // 4)
-        return self._sampled(cube_map(squares, correction), cv2.INTER_CUBIC)
+            lens = nearest_lens(view, self._centres) if len(pictures) > 1 else 0
+            yield self._view(view, offsets, pictures[lens], cv2.INTER_CUBIC)
 
     def cut_mask(self, mask: np.ndarray) -> list[np.ndarray]:
         """Masks (height, width) cut out of one of a panorama (H, 2 H), bool or float32 weights."""
         picture = panorama(mask.astype(np.uint8) if mask.dtype == bool else mask)
-        return [part.astype(mask.dtype) for part in self._sampled(picture, cv2.INTER_NEAREST)]
-
-    def _sampled(self, picture: Picture, how: int) -> Iterator[np.ndarray]:
-        for view, offsets in zip(self._views, self._offsets, strict=True):
-            yield self._view(view, offsets, picture, how)
+        pairs = zip(self._views, self._offsets, strict=True)
+        parts = [self._view(*pair, picture, cv2.INTER_NEAREST) for pair in pairs]
+        return [part.astype(mask.dtype) for part in parts]
 
     def _view(self, view: View, offsets: np.ndarray, picture: Picture, how: int) -> np.ndarray:
         """A view (height, width[, C]) of a picture."""

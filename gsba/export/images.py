@@ -18,9 +18,7 @@ from gsba.camera.rig import CubeRig
 from gsba.camera.views import Scenes, View, ViewCutter, scenes_of, views_for
 from gsba.export.dataset import Dataset
 from gsba.export.pictures import Files, FrameWriter, Pictures, SharedPixels, by_camera
-from gsba.frames.dual_fisheye import load_raw
 from gsba.frames.pixels import load_faces
-from gsba.frames.track_pairs import load_squares
 from gsba.log import GsbaError
 from gsba.memory import give_back_freed_memory
 from gsba.store.shards import Threads, Workers
@@ -110,10 +108,10 @@ class _CubeFaces(FrameWriter):
         originals: Sequence[Path] = ()
 
         def cut() -> Iterable[np.ndarray]:
-            if shown.kind.tracks is not None:
-                return cubemap.cut_squares(load_squares(frames, f), rig, shown.kind.correction)
             if shown.kind.panoramic:
-                return cubemap.cut_padded(shown.padded, rig, shown.room("face", (size, size, 3)))
+                (picture,) = shown.pictures(rig.focal, joined=True)
+                room = shown.room("face", (size, size, 3))
+                return cubemap.faces_of(picture, rig, out=room)
             how = cv2.INTER_AREA if size < shown.kind.width else cv2.INTER_CUBIC
             faces = load_faces(frames, f)
             return [cv2.resize(face, (size, size), interpolation=how) for face in faces]
@@ -143,18 +141,14 @@ class _LensFaces(_OfLenses):
     views: tuple[View, ...]
 
     def __call__(self, shown: SharedPixels) -> None:
-        f, frames, size = shown.f, shown.frames, self.views[0].width
+        f, size = shown.f, self.views[0].width
 
         @cache
         def cutter() -> ViewCutter:
             return ViewCutter(self.views, self.lenses, f, self.scenes(f))
 
         def cut() -> Iterator[np.ndarray]:
-            if shown.kind.fisheyes is not None:
-                return cutter().cut_raw(load_raw(frames, f))
-            if shown.kind.tracks is not None:
-                return cutter().cut_squares(load_squares(frames, f), shown.kind.correction)
-            return cutter().cut_padded(shown.padded)
+            return cutter().cut(shown.pictures(cutter().focal))
 
         def cut_mask() -> Iterator[np.ndarray]:
             return iter(cutter().cut_mask(shown.mask))
@@ -211,19 +205,12 @@ class _Panoramas(FrameWriter):
 @dataclass(frozen=True, slots=True)
 class _Stitched(_OfLenses):
     def __call__(self, shown: SharedPixels) -> None:
-        f, frames = shown.f, shown.frames
-
         @cache
         def stitcher() -> Stitcher:
-            return Stitcher(self.lenses, f, self.scenes(f))
+            return Stitcher(self.lenses, shown.f, self.scenes(shown.f))
 
         def stitched() -> list[np.ndarray]:
-            if shown.kind.fisheyes is not None:
-                return [stitcher().stitched_raw(load_raw(frames, f), shown.kind.width)]
-            if shown.kind.tracks is not None:
-                squares = load_squares(frames, f)
-                return [stitcher().stitched_squares(squares, shown.kind.correction)]
-            return [stitcher().stitched(shown.erp)]
+            return [stitcher().stitched(shown.pictures(), shown.kind.width)]
 
         def mask() -> list[np.ndarray]:
             return [stitcher().stitched_mask(shown.mask)]

@@ -16,12 +16,13 @@ from typing import Any
 
 import numpy as np
 
+from gsba.camera.pictures import Picture, padded_panorama
 from gsba.camera.straighten import PAD
 from gsba.disk import atomic_write, encoded_image, write_bytes
 from gsba.export.dataset import MASK_FILES, MaskStyle
 from gsba.frames.files import goes_out_as_it_is
 from gsba.frames.masks import load_mask
-from gsba.frames.pixels import Buffers, load_padded
+from gsba.frames.pixels import Buffers, load_padded, pictures_of
 from gsba.log import GsbaError
 from gsba.store.shards import even_blocks
 from gsba.types import FrameSet
@@ -249,6 +250,13 @@ class SharedPixels:
     def erp(self) -> np.ndarray:
         """The panorama (h, 2 h, 3) uint8 RGB, until the thread's next frame."""
         return self.padded[PAD:-PAD, PAD:-PAD]
+
+    def pictures(self, focal: float = np.inf, joined: bool = False) -> list[Picture]:
+        """See `gsba.frames.pixels.pictures_of`, until the thread's next frame; `joined`: those of
+        raw lenses as one panorama."""
+        if self.kind.tracks is None and (joined or self.kind.fisheyes is None):
+            return [padded_panorama(self.padded, focal)]
+        return pictures_of(self.frames, self.f, focal)
 
     @property
     def mask(self) -> np.ndarray:

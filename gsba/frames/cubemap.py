@@ -1,21 +1,13 @@
 """Cut the six pinhole faces of a frame out of its panorama."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import cv2
 import numpy as np
 
-from gsba.camera.equiangular import Grid, around_squares, shrunk
+from gsba.camera.pictures import AnyGrid, Picture, cube_map, panorama
 from gsba.camera.rig import CubeRig
-from gsba.camera.sphere import (
-    around_sphere,
-    dense_enough,
-    erp_from_bearings,
-    low_passed,
-    pixel_bands,
-    table,
-)
-from gsba.camera.straighten import PAD
+from gsba.camera.sphere import dense_enough, pixel_bands, table
 from gsba.config import CubemapSettings
 from gsba.frames.masks import load_usable
 from gsba.frames.pixels import load_erp, load_faces
@@ -55,7 +47,8 @@ def load(frames: FrameSet, frame: int, rig: CubeRig) -> tuple[np.ndarray, np.nda
     mask = load_usable(frames, frame)
     masks = None if mask is None else cut_mask(mask, rig)
     if kind.tracks is not None:
-        return cut_squares(load_squares(frames, frame), rig, kind.correction), masks
+        picture = cube_map(load_squares(frames, frame), kind.correction, rig.focal)
+        return np.stack(list(faces_of(picture, rig))), masks
     if kind.panoramic:
         width = dense_enough(kind.width, rig.focal)
         return cut(load_erp(frames, frame, width=width), rig), masks
@@ -76,72 +69,29 @@ def cut(erp: np.ndarray, rig: CubeRig) -> np.ndarray:
     Returns:
         (6, size, size[, C]) uint8, in FACES order.
     """
-    faces = np.empty((len(FACES), rig.size, rig.size, *erp.shape[2:]), np.uint8)
-    padded = around_sphere(low_passed(erp, rig.focal), PAD)
-    for face, (u, v) in zip(faces, _maps_into(padded, rig), strict=True):
-        cv2.remap(padded, u, v, cv2.INTER_CUBIC, dst=face)
-    return faces
+    return np.stack(list(faces_of(panorama(erp, rig.focal), rig)))
 
 
-def cut_padded(padded: np.ndarray, rig: CubeRig, out: np.ndarray) -> Iterator[np.ndarray]:
-    """Faces like those of `cut`, of a panorama with PAD pixels around it: one after the other, all
-    in `out` (size, size[, C])."""
-    inner = padded[PAD:-PAD, PAD:-PAD]
-    small = low_passed(inner, rig.focal)
-    if small is not inner:
-        padded = around_sphere(small, PAD)
-    for u, v in _maps_into(padded, rig):
-        yield cv2.remap(padded, u, v, cv2.INTER_CUBIC, dst=out)
-
-
-def cut_squares(
-    squares: np.ndarray, rig: CubeRig, correction: tuple[float, ...] = ()
-) -> np.ndarray:
-    """Sample the faces of an equi-angular cube map, bicubic, continuous over all its edges.
-
-    Args:
-        squares: (6, S, S[, C]) uint8 of `gsba.camera.equiangular.squares`, FACES order.
-        correction: coefficients of the stitching field, see `FrameSet`.
-
-    Returns:
-        (6, size, size[, C]) uint8, in FACES order.
-    """
-    squares = shrunk(squares, dense_enough(4 * squares.shape[1], rig.focal) // 4)
-    faces = np.empty((len(FACES), rig.size, rig.size, *squares.shape[3:]), np.uint8)
-    picture = around_squares(squares)
-    maps = _grid_maps(rig, Grid(squares.shape[1], correction))
-    for face, (u, v) in zip(faces, maps, strict=True):
-        cv2.remap(picture, u, v, cv2.INTER_CUBIC, dst=face)
-    return faces
+def faces_of(
+    picture: Picture, rig: CubeRig, how: int = cv2.INTER_CUBIC, out: np.ndarray | None = None
+) -> Iterator[np.ndarray]:
+    """Faces (size, size[, C]) of a picture of all directions, in FACES order, one after the other,
+    by an interpolation of OpenCV; all in `out`, if given."""
+    for u, v in _maps(rig, picture.grid):
+        yield cv2.remap(picture.image, u, v, how, dst=out)
 
 
 def cut_mask(mask: np.ndarray, rig: CubeRig) -> np.ndarray:
     """Nearest-neighbour faces (6, size, size) of an ERP mask (H, 2H), bool or float32 weights."""
-    padded = around_sphere(mask.astype(np.uint8) if mask.dtype == bool else mask, PAD)
-    maps = _maps_into(padded, rig)
-    faces = [cv2.remap(padded, u, v, cv2.INTER_NEAREST) for u, v in maps]
-    return np.stack(faces).astype(mask.dtype)
-
-
-def _maps_into(padded: np.ndarray, rig: CubeRig) -> np.ndarray:
-    return _face_maps(rig, padded.shape[1] - 2 * PAD, padded.shape[0] - 2 * PAD)
+    picture = panorama(mask.astype(np.uint8) if mask.dtype == bool else mask)
+    return np.stack(list(faces_of(picture, rig, cv2.INTER_NEAREST))).astype(mask.dtype)
 
 
 @table(maxsize=2)
-def _face_maps(rig: CubeRig, width: int, height: int) -> np.ndarray:
-    """Sampling positions (6, 2, size, size) float32 in the padded panorama, OpenCV pixels."""
-    return _maps_by(rig, lambda rays: erp_from_bearings(rays, width, height) - 0.5 + PAD)
-
-
-@table(maxsize=2)
-def _grid_maps(rig: CubeRig, grid: Grid) -> np.ndarray:
-    """Sampling positions (6, 2, size, size) float32 in an equi-angular grid, OpenCV pixels."""
-    return _maps_by(rig, grid.places)
-
-
-def _maps_by(rig: CubeRig, places: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+def _maps(rig: CubeRig, grid: AnyGrid) -> np.ndarray:
+    """Sampling positions (6, 2, size, size) float32 in a picture, OpenCV pixels."""
     maps = np.empty((len(FACES), 2, rig.size, rig.size), np.float32)
     for face in range(len(FACES)):
         for rows, centres in pixel_bands(np.arange(rig.size), rig.size):
-            maps[face][:, rows] = np.moveaxis(places(rig.bearings(centres, face)), -1, 0)
+            maps[face][:, rows] = np.moveaxis(grid.places(rig.bearings(centres, face)), -1, 0)
     return maps

@@ -1,18 +1,16 @@
 """Grey panoramas of frames of any layout, for sampling on the sphere."""
 
-import functools
-
 import cv2
 import numpy as np
 
-from gsba.camera.rig import CubeRig, owner_faces
-from gsba.camera.sphere import around_sphere, erp_bands
+from gsba.camera.equiangular import Grid, around_squares
+from gsba.camera.rig import owner_faces
+from gsba.camera.sphere import around_sphere, erp_bands, table
 from gsba.camera.straighten import PAD
 from gsba.frames.masks import load_usable
 from gsba.frames.pixels import load_erp, load_faces
+from gsba.frames.track_pairs import maps_of_panorama
 from gsba.types import FACES, FrameSet, PictureFormat, rows_across
-
-_PADDING_PX = 3  # pixels copied from a face's neighbours: the support of bicubic sampling, and one
 
 
 def width_for(kind: PictureFormat, max_width: int) -> int:
@@ -47,11 +45,9 @@ def load_grey(frames: FrameSet, frame: int, width: int) -> tuple[np.ndarray, np.
     present = [FACES.index(name) for name in kind.faces]
     faces[present] = load_faces(frames, frame, gray=True, size=size)
     joined = 4 * size
-    maps, owners = _erp_maps(size, joined)
-    side = size + 2 * _PADDING_PX
-    atlas = np.block(list(map(list, _padded(faces).reshape(3, 2, side, side))))
-    grey = cv2.remap(atlas, maps[0], maps[1], cv2.INTER_CUBIC)
-    usable = np.isin(owners, present)
+    u, v = maps_of_panorama(Grid(size, flat=True), joined)
+    grey = cv2.remap(around_squares(faces, flat=True), u, v, cv2.INTER_CUBIC)
+    usable = np.isin(_owners(joined), present)
     if mask is not None:
         usable &= fit_mask(mask, joined)
     whole = bool(usable.all())
@@ -125,53 +121,10 @@ def fit_mask(mask: np.ndarray, width: int) -> np.ndarray:
     return share > 0.999
 
 
-@functools.lru_cache(maxsize=2)
-def _erp_maps(size: int, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """Places (2, H, W) float32, OpenCV pixels, in the padded owner faces, which lie in two columns
-    of three; owners (H, W) uint8."""
-    rig, shape = CubeRig(size, np.pi / 2), (width // 2, width)
-    maps, owners = np.empty((2, *shape), np.float32), np.empty(shape, np.uint8)
+@table(maxsize=2)
+def _owners(width: int) -> np.ndarray:
+    """Face (width / 2, width) uint8 that owns each pixel of a panorama."""
+    owners = np.empty((width // 2, width), np.uint8)
     for rows, bearings in erp_bands(np.arange(width), width):
         owners[rows] = owner_faces(bearings)
-        pixels = rig.project(bearings, owners[rows])
-        corners = np.stack([owners[rows] % 2, owners[rows] // 2], axis=-1).astype(int)
-        corners *= size + 2 * _PADDING_PX
-        maps[:, rows] = np.moveaxis(pixels - 0.5 + _PADDING_PX + corners, -1, 0)
-    return maps, owners
-
-
-@functools.lru_cache(maxsize=2)
-def _border_maps(size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Owner pixels of the padding of each face, like `_erp_maps`: (2, 6, N, N) and (6, N, N)."""
-    rig = CubeRig(size, np.pi / 2)
-    places = np.arange(-_PADDING_PX, size + _PADDING_PX) + 0.5
-    grid, shape = np.stack(np.meshgrid(places, places), axis=-1), (len(FACES), *2 * places.shape)
-    maps, owners = np.empty((2, *shape), np.float32), np.empty(shape, np.uint8)
-    for face in range(len(FACES)):
-        bearings = rig.bearings(grid, face)
-        owners[face] = owner_faces(bearings)
-        maps[:, face] = np.moveaxis(rig.project(bearings, owners[face]) - 0.5, -1, 0)
-    return maps, owners
-
-
-def _padded(faces: np.ndarray) -> np.ndarray:
-    """Faces (6, N, N) with a border of their neighbours' pixels."""
-    maps, owners = _border_maps(faces.shape[1])
-    out = np.pad(
-        faces, ((0, 0), (_PADDING_PX, _PADDING_PX), (_PADDING_PX, _PADDING_PX)), mode="edge"
-    )
-    inner = np.zeros(owners.shape[1:], bool)
-    inner[_PADDING_PX:-_PADDING_PX, _PADDING_PX:-_PADDING_PX] = True
-    for face in range(len(FACES)):
-        for other in range(len(FACES)):
-            own = (owners[face] == other) & ~inner
-            if own.any():
-                found = cv2.remap(
-                    faces[other],
-                    maps[0, face][own][None],
-                    maps[1, face][own][None],
-                    cv2.INTER_CUBIC,
-                    borderMode=cv2.BORDER_REPLICATE,
-                )
-                out[face][own] = found[0]
-    return out
+    return owners

@@ -5,9 +5,9 @@ import threading
 
 import numpy as np
 
+from gsba.camera.pictures import Picture, cube_map, lens_picture, panorama
 from gsba.camera.sphere import around_sphere
 from gsba.camera.straighten import PAD, straightened, straightened_inside
-from gsba.camera.views import ViewCutter
 from gsba.frames.dual_fisheye import load_joined, load_raw
 from gsba.frames.files import decode
 from gsba.frames.track_pairs import load_squares, panorama_of
@@ -95,12 +95,13 @@ def load_faces(frames: FrameSet, f: int, gray: bool = False, size: int | None = 
     return np.stack(faces)
 
 
-def cut_views(frames: FrameSet, f: int, cutter: ViewCutter) -> list[np.ndarray]:
-    """Images (height, width, 3) uint8 RGB of each view of frame f. `frames`: panoramas; raw pairs
-    and equi-angular cube maps are cut in one step."""
+def pictures_of(frames: FrameSet, f: int, focal: float = np.inf) -> list[Picture]:
+    """Pictures (h, w, 3) uint8 RGB that show frame f, of panoramas: those of all raw lenses, as
+    stored on disk, or one of all directions; for pinhole views of a focal length, pixels."""
     kind = frames.format_of(f)
     if kind.fisheyes is not None:
-        return list(cutter.cut_raw(load_raw(frames, f)))
+        pairs = zip(kind.fisheyes, load_raw(frames, f), strict=True)
+        return [lens_picture(lens, image, focal) for lens, image in pairs]
     if kind.tracks is not None:
-        return list(cutter.cut_squares(load_squares(frames, f), kind.correction))
-    return cutter.cut(load_erp(frames, f))
+        return [cube_map(load_squares(frames, f), kind.correction, focal)]
+    return [panorama(load_erp(frames, f), focal)]

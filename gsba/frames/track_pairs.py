@@ -121,7 +121,7 @@ def load_squares(frames: FrameSet, f: int, gray: bool = False) -> np.ndarray:
 def panorama_of(faces: np.ndarray, width: int, correction: tuple[float, ...] = ()) -> np.ndarray:
     """Panorama (width / 2, width[, 3]) uint8 of upright squares (6, S, S[, 3]) uint8."""
     faces = shrunk(faces, max(round(width / 4), 1))
-    u, v = _maps(Grid(faces.shape[1], correction), width)
+    u, v = maps_of_panorama(Grid(faces.shape[1], correction), width)
     return cv2.remap(around_squares(faces), u, v, cv2.INTER_LANCZOS4)
 
 
@@ -131,7 +131,7 @@ def _decoded(paths: Sequence[Path], size: tuple[int, int], gray: bool) -> np.nda
 
 
 @table(maxsize=2)
-def _maps(grid: Grid, width: int) -> np.ndarray:
+def maps_of_panorama(grid: Grid, width: int) -> np.ndarray:
     """Places (2, width / 2, width) float32 of a panorama's pixels in a grid, OpenCV pixels."""
     maps = np.empty((2, width // 2, width), np.float32)
     for rows, bearings in erp_bands(np.arange(width), width):

@@ -32,7 +32,7 @@ def isotropic(sigmas: np.ndarray) -> np.ndarray:
 
 
 def _no_step(projection: Projection) -> np.ndarray:
-    return np.zeros(sum(parameter.size for parameter in projection.parameters()))
+    return np.zeros(projection.num_parameters)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,10 +1,10 @@
 """The camera of a run: where its lenses are, what they are, and how their rows are read."""
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -95,7 +95,8 @@ def _find_lenses(state: State, sought: Sequence[int], prefix: str) -> State:
             name = f"{prefix}lenses{n}"
             known = run.settings_of(camera).baseline() is not None
             find = partial(_centres, known=known)
-            centres = _from_features(trial, name, camera, find, LensCentres, noted=True)
+            given = name, camera, _seen_by_features, find, LensCentres
+            centres = _estimated(trial, *given, noted=True)
             map_, lenses[camera] = map_.changed(camera, centres=centres), centres.lenses
         left = [camera for camera in left if lenses[camera]]
         if not left:
@@ -137,13 +138,12 @@ def _with_stitch_radii(start: State, stitched: Sequence[int], prefix: str) -> St
     tried = dict[int, Lenses]()
 
     def asked(state: State, stage: str, camera: int) -> StitchRadius:
-        return _from_features(
-            state, prefix + stage, camera, lens_centres.stitched_for, StitchRadius
-        )
+        given = _seen_by_features, lens_centres.stitched_for, StitchRadius
+        return _estimated(state, prefix + stage, camera, *given)
 
     for camera in stitched:
         first = asked(start, "stitch_radius", camera)
-        start = replace(start, map=start.map.changed(camera, radius=first))
+        start = replace(start, map=start.map.changed(camera, stitch_radius=first))
         lenses = first.on_trial(start.observed.cameras.lenses[camera])
         if lenses is not None:
             tried[camera] = lenses
@@ -155,8 +155,8 @@ def _with_stitch_radii(start: State, stitched: Sequence[int], prefix: str) -> St
     trial = _settle_cameras(trial, f"{prefix}settled")
     judged = {camera: asked(trial, "stitch_radius_tried", camera) for camera in tried}
     for camera, radius in judged.items():
-        start = replace(start, map=start.map.changed(camera, radius=radius))
-        trial = replace(trial, map=trial.map.changed(camera, radius=radius))
+        start = replace(start, map=start.map.changed(camera, stitch_radius=radius))
+        trial = replace(trial, map=trial.map.changed(camera, stitch_radius=radius))
     taken = {camera: tried[camera] for camera, radius in judged.items() if not radius.reason}
     if len(taken) == len(tried):
         return trial
@@ -186,8 +186,8 @@ def _on_trial(
         lenses = Lenses() if yaws is None else Lenses.ring(np.deg2rad(yaws))
         trial = _through(trial, camera, lenses)
         if not _axes_known(run, camera):
-            given = f"{prefix}axes", camera, lens_axes.guess, LensAxes
-            guesses[camera] = _from_features(trial, *given)
+            given = f"{prefix}axes", camera, _seen_by_features, lens_axes.guess, LensAxes
+            guesses[camera] = _estimated(trial, *given)
             lenses = guesses[camera].lenses
         trial = _through(trial, camera, replace(lenses, band_rad=seam_band.NARROWEST))
     return trial, guesses
@@ -210,7 +210,8 @@ def _calibrate_raw(trial: State, raw: Sequence[int]) -> State:
             trial = trial.with_lenses(camera, lenses)
             continue
         find = _calibration(run, camera)
-        known = _from_features(trial, "calibrated", camera, find, SelfCalibration)
+        given = "calibrated", camera, _seen_by_features, find, SelfCalibration
+        known = _estimated(trial, *given)
         trial = replace(trial, map=trial.map.changed(camera, calibrated=known))
         if not known.reason:
             trial, free = trial.with_lenses(camera, known.lenses), True
@@ -234,9 +235,8 @@ def _settle_cameras(state: State, name: str) -> State:
     for camera, one in enumerate(found.each):
         if one.lenses and one.lenses.readout_motion is None:
             stage = f"{name}_readout"
-            read = _from_features(
-                state, stage, camera, readout.estimate, CameraEstimate, noted=True
-            )
+            given = stage, camera, _seen_by_features, readout.estimate, CameraEstimate
+            read = _estimated(state, *given, noted=True)
             found = found.changed(camera, read)
     return _solve_with_cameras(state, found, name)
 
@@ -268,34 +268,36 @@ def take_parts_from_patches(state: State, sighted: Sighted, name: str, number: i
     """The map with the parts of cameras that aligned patches show, its poses yet to follow:
     estimate 0 of a round finds how rows are read, 1 which axes and calibration lenses have, if not
     known."""
-    run = state.run
-    for camera, one in enumerate(state.map.cameras):
-        lenses = one.lenses
-        if not lenses:
-            continue
-        vanished = one.estimate().reason == readout.VANISHED
-        if number == 0 and lenses.readout_motion is None and not vanished:
-            given = f"readout_{name}", camera, readout.estimate, CameraEstimate
-            read = _from_patches(state, sighted, *given)
-            state = state.with_cameras(state.map.estimates().changed(camera, read))
-        raw = camera in _raw_cameras(run)
-        if number == 1 and raw and lenses.fisheyes is None:  # the rest has settled
-            given = f"calibrated_{name}", camera, _calibration(run, camera), SelfCalibration
-            known = _from_patches(state, sighted, *given)
-            state = replace(state, map=state.map.changed(camera, calibrated=known))
-            state = state.with_lenses(camera, known.lenses)
-        if number == 1 and not _axes_known(run, camera) and lenses.axes is None:
-            given = f"axes_{name}", camera, lens_axes.loosened, LensAxes
-            axes = _from_patches(state, sighted, *given)
-            state = replace(state, map=state.map.changed(camera, axes=axes))
-            state = state.with_lenses(camera, axes.lenses)
-        unstitched = raw or _in_one_place(state.map, camera)
-        if number == 1 and not unstitched and not lenses.inverse_stitch_radius:
-            given = f"stitch_radius_{name}", camera, lens_centres.stitched_for, StitchRadius
-            radius = _from_patches(state, sighted, *given)
-            state = replace(state, map=state.map.changed(camera, radius=radius))
-            state = state.with_lenses(camera, radius.lenses)
+    observe = partial(_seen_by_patches, sighted=sighted)
+    for camera in range(len(state.map.cameras)):
+        for part, estimate, returns in list(_missing_parts(state, camera, number)):
+            stage = f"{part}_{name}"
+            found = _estimated(state, stage, camera, observe, estimate, returns, noted=True)
+            changed = state.map.changed(camera, **{part: found})
+            state = replace(state, map=changed).with_lenses(camera, found.lenses)
     return state
+
+
+def _missing_parts(
+    state: State, camera: int, number: int
+) -> Iterator[tuple[str, Callable[[ObservedRays], Any], type]]:
+    """Parts of a camera that estimate `number` of a round looks for: field of `FoundCamera`,
+    estimate, and type of the result."""
+    run, one = state.run, state.map.cameras[camera]
+    lenses, raw = one.lenses, camera in _raw_cameras(run)
+    if not lenses:
+        return
+    if number == 0:
+        if lenses.readout_motion is None and one.estimate().reason != readout.VANISHED:
+            yield "readout", readout.estimate, CameraEstimate
+        return
+    if raw and lenses.fisheyes is None:  # the rest has settled
+        yield "calibrated", _calibration(run, camera), SelfCalibration
+    if not _axes_known(run, camera) and lenses.axes is None:
+        yield "axes", lens_axes.loosened, LensAxes
+    unstitched = raw or _in_one_place(state.map, camera)
+    if not unstitched and not lenses.inverse_stitch_radius:
+        yield "stitch_radius", lens_centres.stitched_for, StitchRadius
 
 
 def adjust_with_patches(
@@ -397,71 +399,66 @@ def _centres(rays: ObservedRays, known: bool) -> LensCentres:
     return replace(found, lenses=replace(found.lenses, centre=found.found))
 
 
-def _from_features(
+def _estimated(
     state: State,
     stage: str,
-    number: int,
+    camera: int,
+    observe: Callable[[State, int], ObservedRays],
     estimate: Callable[[ObservedRays], T],
     returns: type[T],
     *,
     noted: bool = False,
 ) -> T:
-    """An estimate of one camera from points of the state's matches with all that is within a gate.
+    """An estimate of one camera from the rays that `observe` gives. The stage is named after the
+    first recording of that camera, too, if there are several."""
+    run = state.run
+    if len(run.frames.formats) > 1:
+        stage = f"{stage}@{names_of_cameras(run.frames)[camera]}"
+
+    def compute() -> T:
+        return estimate(observe(state, camera))
+
+    return run.stage(stage, _settings_of_cameras(run), compute, returns, noted=noted)
+
+
+def _seen_by_features(state: State, camera: int) -> ObservedRays:
+    """Points of the state's matches with all that is within a gate.
 
     Observations that one centre threw off are far: the gate is wide until there are two, and poses
-    count as unsure as it is wide. The stage is named after the camera, too, if there are several.
+    count as unsure as it is wide.
     """
-    run, observed, solution = state.run, state.observed, state.solution
-    lenses = observed.cameras.lenses[number]
+    observed, solution = state.observed, state.solution
+    lenses = observed.cameras.lenses[camera]
     gate = GATE_SCALE if lenses else 30.0  # a wrong camera throws observations off
-
-    def compute() -> T:
-        tracks = tracks_of_camera(backend.tracks_of(state), observed.cameras.of_frame, number)
-        placed = state.triangulated(tracks, observed.keypoints, gate * solution.noise)
-        wide = replace(solution, landmarks=placed, noise=solution.noise * gate / GATE_SCALE)
-        shown = observed.shown.bearings_rig
-        return estimate(_rays(state, number, wide, observed.keypoints, lenses, shown))
-
-    name = _named(run, stage, number)
-    return run.stage(name, _settings_of_cameras(run), compute, returns, noted=noted)
+    tracks = tracks_of_camera(backend.tracks_of(state), observed.cameras.of_frame, camera)
+    placed = state.triangulated(tracks, observed.keypoints, gate * solution.noise)
+    wide = replace(solution, landmarks=placed, noise=solution.noise * gate / GATE_SCALE)
+    shown = observed.shown.bearings_rig
+    return _rays(state, camera, wide, observed.keypoints, lenses, shown)
 
 
-def _from_patches(
-    state: State,
-    sighted: Sighted,
-    stage: str,
-    number: int,
-    estimate: Callable[[ObservedRays], T],
-    returns: type[T],
-) -> T:
-    """An estimate of one camera from aligned patches; arguments as for `_from_features`."""
+def _seen_by_patches(state: State, camera: int, sighted: Sighted) -> ObservedRays:
+    """Points of aligned patches."""
     run, map_ = state.run, state.map
-
-    def compute() -> T:
-        there = replace(sighted, keypoints=map_.rays(sighted.keypoints, run.rig))
-        there = adjustment.rescale_noise(there, map_.solution, run.settings)
-        gate = ALIGNED_GATES[0]
-        tracks = tracks_of_camera(there.tracks, map_.of_frame, number)
-        placed = state.triangulated(tracks, there.keypoints, gate)
-        solution = replace(map_.solution, noise=1.0, landmarks=placed)
-        shown = stitching.corrected(sighted.keypoints, map_.field, run.rig).bearings_rig
-        lenses = map_.cameras[number].lenses
-        return estimate(_rays(state, number, solution, there.keypoints, lenses, shown))
-
-    name = _named(run, stage, number)
-    return run.stage(name, _settings_of_cameras(run), compute, returns, noted=True)
+    there = replace(sighted, keypoints=map_.rays(sighted.keypoints, run.rig))
+    there = adjustment.rescale_noise(there, map_.solution, run.settings)
+    tracks = tracks_of_camera(there.tracks, map_.of_frame, camera)
+    placed = state.triangulated(tracks, there.keypoints, ALIGNED_GATES[0])
+    solution = replace(map_.solution, noise=1.0, landmarks=placed)
+    shown = stitching.corrected(sighted.keypoints, map_.field, run.rig).bearings_rig
+    return _rays(state, camera, solution, there.keypoints, map_.cameras[camera].lenses, shown)
 
 
 def _rays(
     state: State,
-    number: int,
+    camera: int,
     solution: Solution,
     keypoints: Keypoints,
     lenses: Lenses,
     shown: np.ndarray,
 ) -> ObservedRays:
     """Rays of one camera, with the priors and settings of its estimates."""
-    context, times = state.adjustment_context().of_camera(number), state.run.frames.timestamps
+    context, times = state.adjustment_context().of_camera(camera), state.run.frames.timestamps
     return ObservedRays(solution, keypoints, context, lenses, shown, times)
 
 
@@ -477,13 +474,6 @@ def _axes_known(run: Run, camera: int) -> bool:
 
 def _raw_cameras(run: Run) -> list[int]:
     return [c for c, kind in enumerate(run.frames.formats) if kind.fisheyes is not None]
-
-
-def _named(run: Run, stage: str, camera: int) -> str:
-    """Name of a stage about one camera: of several, with the first recording of that camera."""
-    if len(run.frames.formats) == 1:
-        return stage
-    return f"{stage}@{names_of_cameras(run.frames)[camera]}"
 
 
 def _settings_of_cameras(run: Run) -> list[object]:

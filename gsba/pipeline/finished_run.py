@@ -14,7 +14,7 @@ from gsba.frames.recordings import own_timestamps
 from gsba.localization.run_map import FEATURE_STAGES, require_own_version
 from gsba.log import GsbaError
 from gsba.loop_closure.connectivity import by_size
-from gsba.pipeline.map import FoundCamera, Map
+from gsba.pipeline.map import Map
 from gsba.pipeline.state import State
 from gsba.similarity import Sim3
 from gsba.store.finished import load_run
@@ -210,17 +210,8 @@ def _map_of(map_: Map, rows: np.ndarray) -> Map:
         frame_weights=map_.frame_weights[rows],
         aligned=None if map_.aligned is None else map_.aligned[chosen],
         normals_rig=None if map_.normals_rig is None else map_.normals_rig[chosen],
-        cameras=tuple(_camera_of(map_.cameras[c], rows) for c in used),
+        cameras=tuple(map_.cameras[c].taken(rows) for c in used),
         of_frame=of_frame,
         covariances=None,
         moves=(),
-    )
-
-
-def _camera_of(found: FoundCamera, rows: np.ndarray) -> FoundCamera:
-    centres, readout = found.centres, found.readout
-    return replace(
-        found,
-        centres=centres and replace(centres, lenses=centres.lenses.taken(rows)),
-        readout=readout and replace(readout, lenses=readout.lenses.taken(rows)),
     )

@@ -1,9 +1,10 @@
 """The front end of a run: keypoints as bearings, their matches, and what these say of the start."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -42,6 +43,8 @@ from gsba.types import (
     VerifiedPairs,
     rows_across,
 )
+
+T = TypeVar("T")
 
 _NUM_STEPS = 3  # compared, spread over the walk
 _DRIFT_PER_FRAME = 0.13  # times frames over squared matches of a step: the drift of rendered walks
@@ -130,8 +133,9 @@ def _matchable(
         settings,
         run.store.workers,
         learned.make_matcher(settings, run.weights, run.rig.size),
+        Cameras.plain(run.frames),
     )
-    return ObservedFrames(tuple(found), keypoints, context, Cameras.plain(run.frames))
+    return ObservedFrames(tuple(found), keypoints, context)
 
 
 def of_recording(state: State, number: int) -> State:
@@ -316,52 +320,48 @@ def _hindrance(run: Run) -> str:
 
 def match_along_epipolars(state: State, name: str = "adjacent") -> State:
     """Matches of neighbours in time along their solved epipolar lines, for those before."""
-    run, context = state.run, state.observed.context
-    maps = state.maps_of_images()
-    compute = partial(correspondences.match_along_epipolars, context, state.solution, maps)
-    found = run.stage(name, run.matching_key(), compute, Matches)
+    find, maps = correspondences.match_along_epipolars, state.maps_of_images()
+    found = _matched(state, name, Matches, find, maps)
     return replace(state, matches=replace(state.matches, neighbours=found))
 
 
 def match_across(state: State, parts: np.ndarray) -> State:
     """Verified matches of frames whose parts (F,) images joined; others between these are
     dropped."""
-    run, context, merged = state.run, state.observed.context, state.prior.merged
+    merged, find = state.prior.merged, correspondences.match_across
     assert merged is not None
-    compute = partial(correspondences.match_across, context, state.solution, parts, merged.met)
-    found = run.stage("across", run.matching_key(), compute, VerifiedPairs).matches
+    found = _matched(state, "across", VerifiedPairs, find, parts, merged.met).matches
     return replace(state, matches=replace(state.matches.within(parts), across=found))
 
 
 def match_known_points(state: State, name: str, loops_closed: bool = True) -> State:
     """Matches of the map's points in frames further apart, for all but those of neighbours."""
-    run, context = state.run, state.observed.context
-    compute = partial(correspondences.match_known_points, context, state.solution, loops_closed)
-    found = run.stage(name, run.matching_key(), compute, Matches)
+    found = _matched(state, name, Matches, correspondences.match_known_points, loops_closed)
     return replace(state, matches=MapMatches(state.matches.neighbours, known_points=found))
 
 
 def match_known_points_across(state: State, parts: np.ndarray, name: str) -> State:
     """Matches of the map's points in frames of another part (F,), for those across before."""
-    run, context = state.run, state.observed.context
-    compute = partial(correspondences.match_known_points_across, context, state.solution, parts)
-    found = run.stage(name, run.matching_key(), compute, Matches)
+    found = _matched(state, name, Matches, correspondences.match_known_points_across, parts)
     return replace(state, matches=replace(state.matches, across=found))
+
+
+def _matched(
+    state: State, name: str, returns: type[T], find: Callable[..., T], *given: object
+) -> T:
+    """Matches that `find` gives of the state's frames under its poses, stored as a stage."""
+    run, compute = state.run, partial(find, state.observed.context, state.solution, *given)
+    return run.stage(name, run.matching_key(), compute, returns)
 
 
 def close_loops(state: State) -> State:
     """Matches of places met again, and the map, bent first where drift had hidden them."""
-    near = _match_loops(state, "loops")
+    find = correspondences.match_loops
+    near = _matched(state, "loops", VerifiedPairs, find)
     bent = _meet_places(state, near)
     if bent is not state:
-        near = _match_loops(bent, "loops2")
+        near = _matched(bent, "loops2", VerifiedPairs, find)
     return replace(bent, matches=replace(bent.matches, loops=near.matches))
-
-
-def _match_loops(state: State, name: str) -> VerifiedPairs:
-    run, context = state.run, state.observed.context
-    compute = partial(correspondences.match_loops, context, state.solution)
-    return run.stage(name, run.matching_key(), compute, VerifiedPairs)
 
 
 def _meet_places(state: State, near: VerifiedPairs) -> State:
@@ -371,9 +371,7 @@ def _meet_places(state: State, near: VerifiedPairs) -> State:
     pairs = near.matches.pairs
     if len(pairs) and connectivity.parted(pairs, ~unseen) is None:
         return state
-    known = state.observed.context, state.solution, unseen, run.store.scratch_folder
-    compute = partial(loops.close, *known)
-    closed = run.stage("places", run.matching_key(), compute, Closed)
+    closed = _matched(state, "places", Closed, loops.close, unseen, run.store.scratch_folder)
     if len(closed.pairs) == 0:
         return state
     # Places met again know better than a step that no image shows.

@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from gsba.bundle.found_camera import FoundCamera
 from gsba.bundle.readout import CameraEstimate, velocities
 from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.config import CameraSettings
 from gsba.frames.recordings import one_mode, own_timestamps
 from gsba.log import GsbaError
 from gsba.pipeline.finished_run import FinishedRun
-from gsba.pipeline.map import FoundCamera
 from gsba.similarity import Sim3
 from gsba.types import FrameSet, PictureFormat, Solution
 
@@ -112,7 +112,8 @@ class JointCameras:
             inside = self.in_run(camera, number)
             assert inside is not None
             known, scale = runs[number].map.cameras[inside], moves[number].scale
-            found, centres, radius = estimate(camera, known, scale), known.centres, known.radius
+            found, centres = estimate(camera, known, scale), known.centres
+            radius = known.stitch_radius
             if centres is not None:
                 lenses = Lenses() if found is None else found.lenses
                 covariance, centre = centres.covariance * scale**2, scale * centres.found

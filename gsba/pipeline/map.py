@@ -7,45 +7,13 @@ import numpy as np
 from factors.sphere_field import SphereField
 from gsba.bundle import stitching
 from gsba.bundle.camera_adjustment import CameraCovariances
-from gsba.bundle.lens_axes import LensAxes
-from gsba.bundle.lens_centres import LensCentres, StitchRadius
-from gsba.bundle.readout import CameraEstimate, CameraEstimates
-from gsba.bundle.self_calibration import SelfCalibration
+from gsba.bundle.found_camera import FoundCamera
+from gsba.bundle.readout import CameraEstimates
 from gsba.bundle.stitching import Stitching
 from gsba.camera.cameras import Cameras
-from gsba.camera.lens import Lenses
 from gsba.camera.rig import CubeRig
 from gsba.splat.refinement import PoseMove
 from gsba.types import FrameSet, Keypoints, Solution
-
-
-@dataclass(frozen=True, slots=True)
-class FoundCamera:
-    """One camera of a map, as estimates have found it."""
-
-    centres: LensCentres | None = None  # of the lenses that see it; None = not looked for
-    axes: LensAxes | None = None  # where these look; None = not looked for
-    radius: StitchRadius | None = None  # what panoramas are stitched for; None = not looked for
-    calibrated: SelfCalibration | None = None  # of raw pairs; None = not looked for
-    readout: CameraEstimate | None = None  # how lenses are read; None = not looked for
-
-    @property
-    def lenses(self) -> Lenses:
-        """What sees the observations."""
-        return Lenses() if self.centres is None else self.centres.lenses
-
-    def estimate(self) -> CameraEstimate:
-        """The lenses, and how they are read."""
-        if self.readout is None:
-            return CameraEstimate(self.lenses, reason="not looked for")
-        return replace(self.readout, lenses=self.lenses)
-
-    def with_estimate(self, found: CameraEstimate) -> "FoundCamera":
-        """The camera with other lenses, or read otherwise; one that was not looked for stays."""
-        if self.centres is None:
-            return self
-        centres = replace(self.centres, lenses=found.lenses, found=found.lenses.centre)
-        return replace(self, centres=centres, readout=found)
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,12 +37,6 @@ class Map:
         weights = np.ones(len(solution.world_T_rigs))
         cameras = (FoundCamera(),) * len(frames.formats)
         return cls(solution, keypoints, weights, cameras=cameras, of_frame=frames.camera_of_frame)
-
-    @property
-    def only(self) -> FoundCamera:
-        """The only camera; ValueError if there are several."""
-        (found,) = self.cameras
-        return found
 
     def changed(self, camera: int, **changes: object) -> "Map":
         """The map with one camera changed."""

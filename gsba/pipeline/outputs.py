@@ -217,18 +217,10 @@ def _of_camera(
     if found.centres is None:
         return None, []
     known = None if map_.covariances is None else map_.covariances.cameras[number]
-    content, notes = of_camera(
-        found.centres,
-        found.readout,
-        found.axes,
-        found.radius,
-        known,
-        world_scale(state.solution, result),
-        run.settings_of(number),
-        run.frames.timed,
-    )
+    scale = world_scale(state.solution, result)
+    content, notes = of_camera(found, known, scale, run.settings_of(number), run.frames.timed)
     if kind.fisheyes is not None:
-        content["lenses"], of_raw = of_lenses(found.lenses, found.calibrated, known)
+        content["lenses"], of_raw = of_lenses(found, known)
         notes += of_raw
     return content, notes
 

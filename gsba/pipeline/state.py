@@ -27,7 +27,6 @@ class ObservedFrames:
     features: tuple[PerFrame[Features], ...]  # (F,) stage that holds each frame's
     shown: Keypoints  # of all frames, where pictures show them
     context: MatchContext  # matches them
-    cameras: Cameras  # that the keypoints are seen through
     more: bool = False  # whether all frames got as many keypoints as weak ones from the start
 
     @property
@@ -35,10 +34,15 @@ class ObservedFrames:
         """Of all frames, as rays of the cameras."""
         return self.context.keypoints
 
+    @property
+    def cameras(self) -> Cameras:
+        """Cameras that the keypoints are seen through."""
+        return self.context.cameras
+
     def through(self, cameras: Cameras) -> "ObservedFrames":
         """The frames with their keypoints as rays that start at the lenses of these cameras."""
         context = replace(self.context, keypoints=cameras.seen(self.shown), cameras=cameras)
-        return replace(self, context=context, cameras=cameras)
+        return replace(self, context=context)
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,21 +5,18 @@ from typing import Any
 import numpy as np
 
 from gsba.bundle.camera_adjustment import CameraSigmas
-from gsba.bundle.lens_axes import LensAxes
-from gsba.bundle.lens_centres import LensCentres, StitchRadius, baseline_of, radius_sigma
+from gsba.bundle.found_camera import FoundCamera
+from gsba.bundle.lens_centres import baseline_of, radius_sigma
 from gsba.bundle.readout import CameraEstimate
-from gsba.bundle.self_calibration import SelfCalibration, first_of, num_parameters, undetermined
+from gsba.bundle.self_calibration import first_of, num_parameters, undetermined
 from gsba.camera.fisheye import lens_names
-from gsba.camera.lens import Lenses, all_centres
+from gsba.camera.lens import all_centres
 from gsba.config import CameraSettings
 from gsba.placement.placement import metres_per_unit
 
 
 def of_camera(
-    centres: LensCentres,
-    readout: CameraEstimate | None,
-    axes: LensAxes | None,
-    radius: StitchRadius | None,
+    found: FoundCamera,
     known: CameraSigmas | None,
     scale: float,
     settings: CameraSettings,
@@ -28,7 +25,7 @@ def of_camera(
     """Baseline, axes, stitch radius and readout of two lenses.
 
     Args:
-        readout, axes, radius: further estimates; None = not estimated.
+        found: estimates of the camera, those of its lenses' centres at least.
         known: covariances of these; None = one centre is as likely.
         scale: units of the result per map unit.
         settings: published baseline and readout time.
@@ -38,6 +35,8 @@ def of_camera(
         Content of report.json and notes. Lengths are in units of the result; `metres_per_unit`
         follows from the published baseline.
     """
+    centres, radius, readout = found.centres, found.stitch_radius, found.readout
+    assert centres is not None
     length, sigma = baseline_of(centres, scale)
     content = {
         "taken": bool(centres.lenses),
@@ -66,9 +65,9 @@ def of_camera(
             f"one map unit is {metres:.4g} m (sigma {100 * of_metres / metres:.2g} %), if the "
             f"lenses are {1e3 * baseline[0]:g} mm apart"
         )
-    if axes is not None:
+    if found.axes is not None:
         content["turned_below_panorama"] = centres.lenses.axes is not None
-        content["gain_of_axes"] = axes.gains
+        content["gain_of_axes"] = found.axes.gains
         if centres.lenses.axes is not None:
             notes.append("the lenses rotate relative to the panoramas: a stabiliser was on")
     content["seam_band_deg"] = np.rad2deg(centres.lenses.band_rad)
@@ -101,17 +100,10 @@ def of_camera(
     return content, notes
 
 
-def of_lenses(
-    lenses: Lenses, voted: SelfCalibration | None, known: CameraSigmas | None
-) -> tuple[dict[str, Any], list[str]]:
-    """Self-calibrated lenses of raw fisheyes.
-
-    Args:
-        voted: check of the given calibration by features; None = the lenses were estimated.
-
-    Returns:
-        Content of report.json and notes.
-    """
+def of_lenses(found: FoundCamera, known: CameraSigmas | None) -> tuple[dict[str, Any], list[str]]:
+    """Self-calibrated lenses of raw fisheyes; `known`: covariances of these, None = not computed.
+    Returns content of report.json and notes."""
+    lenses, voted = found.lenses, found.calibrated
     if lenses.fisheyes is None:
         reason = "" if voted is None else voted.reason
         return {"taken": False, "reason": reason}, []

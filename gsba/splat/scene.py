@@ -11,7 +11,7 @@ from gsba.camera.views import ONE_EYE, Optics, View, turned_rigs
 from gsba.frames import cubemap
 from gsba.frames.held_out import HOLD_OUT_EVERY, held_out_rows
 from gsba.frames.masks import load_mask
-from gsba.frames.pixels import cut_views
+from gsba.frames.pixels import pictures_of
 from gsba.log import GsbaError, track
 from gsba.splat.camera import view_camera
 from gsba.splat.gaussians import Gaussians, from_cloud
@@ -97,7 +97,8 @@ def cut_lens_faces(
     times = int(np.clip(-(-kind.width / (2 * np.pi) // views[0].focal), 1, _MAX_OVERSAMPLING))
     finer = tuple(view.finer(times) for view in views)
     cutter = optics.cutter(finer, frame)
-    images, whole = cut_views(frames, frame, cutter), load_mask(frames, frame)
+    images = list(cutter.cut(pictures_of(frames, frame, cutter.focal)))
+    whole = load_mask(frames, frame)
     masks = None if whole is None else cutter.cut_mask(whole)
     if times == 1:
         return images, masks

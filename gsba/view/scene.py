@@ -12,7 +12,7 @@ from gsba.camera.views import ONE_EYE, Optics, View
 from gsba.evaluate.scans import colors_of
 from gsba.frames import cubemap
 from gsba.frames.masks import load_mask
-from gsba.frames.pixels import cut_views
+from gsba.frames.pixels import pictures_of
 from gsba.geometry import rotation_from_quaternion
 from gsba.log import GsbaError
 from gsba.placement.world import Placement, read_placement
@@ -137,7 +137,8 @@ def faces_of(
     if optics:
         views = views_of(frames, f, optics)
         cutter = optics.cutter(views, f)
-        images, mask = cut_views(frames, f, cutter), load_mask(frames, f) if masked else None
+        images = list(cutter.cut(pictures_of(frames, f, cutter.focal)))
+        mask = load_mask(frames, f) if masked else None
         if mask is not None:
             pairs = zip(images, cutter.cut_mask(mask), strict=True)
             images = [_tinted(image, use) for image, use in pairs]

@@ -73,7 +73,7 @@ def test_a_tight_gate_does_not_confirm_the_start(start: float) -> None:
         found.append(
             solve_with_camera(tracks, shown, CameraEstimates((known,)), *given, (6.0, 3.0))[1]
         )
-    centres = [one.only.lenses.centre for one in found]
+    centres = [one.each[0].lenses.centre for one in found]
     np.testing.assert_allclose(*centres, atol=1e-5)  # a standard deviation is 7e-5
 
 
@@ -135,7 +135,7 @@ def test_covariances_are_those_of_errors_and_wider_than_of_a_known_camera() -> N
     errors = []
     for seed in range(4):
         world, _, given = _settled(LENSES, CameraEstimate(LENSES, READOUT_S), seed)
-        whole, camera = CameraSystem(*given).covariances(), given[2].only
+        whole, camera = CameraSystem(*given).covariances(), given[2].each[0]
         (measured,) = whole.cameras
         scale = pose_similarity(given[0].world_T_rigs, world.world_T_rigs).scale
         off = scale * camera.lenses.centre - CENTRE

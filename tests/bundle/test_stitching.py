@@ -13,7 +13,7 @@ from gsba.bundle import adjustment, stitching
 from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.families import Bearings, Families
 from gsba.bundle.optimizer import SolverOptions, optimize
-from gsba.bundle.shared_parameters import PARTS, ObservedRays, SharedModel, model_of, parts_of
+from gsba.bundle.shared_parameters import PARTS, ObservedRays, SharedModel, parts_of, whole_model
 from gsba.bundle.stitching import Stitching, corrected, with_noise_of
 from gsba.bundle.trajectory_prior import TrajectoryPrior
 from gsba.camera.sphere import erp_directions
@@ -145,7 +145,8 @@ def test_model_predicts_the_cost() -> None:
         there = corrected(keypoints, field, RIG)
         by_field = stitching._by_field(keypoints, there, 3)
         around = replace(solution, landmarks=landmarks)
-        model = model_of(ObservedRays(around, there, problem), by_field)
+        model = whole_model(ObservedRays(around, there, problem), [], by_field)
+        assert model is not None
         return model.around(field.coefficients)
 
     before, cost = solved(SphereField.none())

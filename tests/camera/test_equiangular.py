@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 import pytest
-from cube_map_tracks import picture_tracks, track_directions
+from cube_map_tracks import picture_tracks
 from pixels import pixel_centres
 from synthetic import unit
 from two_fisheyes import colours
@@ -16,7 +16,6 @@ from gsba.camera.equiangular import (
     square_directions,
     square_pixels,
     squares,
-    taps,
 )
 from gsba.types import FACES
 
@@ -34,48 +33,6 @@ def _directions(seed: int) -> np.ndarray:
     seam = rng.normal(size=(4000, 3)) * [1, 1, 0.02]
     found = np.concatenate([anywhere, edges, seam])
     return found / np.linalg.norm(found, axis=1, keepdims=True)
-
-
-def _sample(track: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Values (N, C) float of a track (H, W, C) at pixels (N, 2), linear between centres."""
-    u, v = (pixels - 0.5).astype(np.float32).T[:, None]
-    how, border = cv2.INTER_LINEAR, cv2.BORDER_REPLICATE
-    return cv2.remap(track.astype(np.float32), u, v, how, borderMode=border)[0]
-
-
-@pytest.mark.parametrize(("size", "overlap"), SIZES)
-def test_taps_are_the_pixels_that_show_a_direction(size: int, overlap: int) -> None:
-    """Exactly: each pixel's own direction leads back to it, by one of the taps."""
-    directions, width = track_directions(size, overlap), 3 * size + 2 * overlap
-    v, u = np.mgrid[:size, :width] + 0.5
-    for track in (0, 1):
-        found = taps(directions[track], width, size)
-        off = np.linalg.norm(found.pixels - np.stack([u, v], -1)[:, :, None], axis=-1)
-        assert (found.tracks == track).all()
-        assert off.min(axis=-1).max() < 1e-9
-        np.testing.assert_allclose(found.weights.sum(axis=-1), 1)
-        alone = found.weights.max(axis=-1) == 1
-        doubled = 4 * overlap  # columns of two side squares, twice each
-        assert (~alone).sum() == size * doubled
-
-
-@pytest.mark.parametrize(("size", "overlap"), SIZES)
-def test_taps_reproduce_a_smooth_sphere(size: int, overlap: int) -> None:
-    """Across all edges and in the doubled columns, as well as linear interpolation can."""
-    directions = _directions(0)
-    true = colours(directions)
-    tracks = picture_tracks(size, overlap, colours)
-    found = taps(directions, 3 * size + 2 * overlap, size)
-    shown = np.zeros_like(true)
-    for track in (0, 1):
-        own = found.tracks == track
-        for tap in (0, 1):
-            values = _sample(tracks[track], found.pixels[own, tap])
-            shown[own] += found.weights[own, tap, None] * values
-    # a step of a pixel is pi / (2 size); half of it beyond a border goes unseen by one tap
-    step = np.pi / (2 * size)
-    assert np.abs(shown - true).max() < 95 * (6 * step / 2 + 0.01)
-    assert np.abs(shown - true).mean() < 0.8
 
 
 @pytest.mark.parametrize(("size", "overlap"), SIZES)

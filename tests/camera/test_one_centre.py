@@ -12,6 +12,7 @@ from two_fisheyes import colours, made_pair
 from gsba.camera.fisheye import Pair, rotation_of, unproject
 from gsba.camera.lens import Lenses, rows_run
 from gsba.camera.one_centre import Stitcher
+from gsba.camera.pictures import lens_picture, panorama
 from gsba.camera.sphere import erp_directions
 from gsba.camera.views import depths_along
 from gsba.types import Fisheye
@@ -71,7 +72,7 @@ def test_a_stitched_panorama_becomes_one_cameras(lenses: Lenses) -> None:
     nowhere = np.zeros(given[..., 0].size, int)
     along = lenses.own(erp_directions(WIDTH).reshape(-1, 3), nowhere)[:, 2].reshape(given.shape[:2])
     seam = np.abs(along) < np.sin(np.deg2rad(5))
-    found = _off(Stitcher(lenses, 0, _scene()).stitched(given), seam)
+    found = _off(Stitcher(lenses, 0, _scene()).stitched([panorama(given)], WIDTH), seam)
     before = _off(given, seam)
     assert found[1] < 0.4 and before[1] > 3 * found[1]  # rounding alone makes .25
     assert found[0] < 0.6 and before[0] > 2.5 * found[0]
@@ -107,13 +108,14 @@ def _raw(pair: Pair, ways: tuple[float, float]) -> tuple[Lenses, list[np.ndarray
 @pytest.mark.parametrize("ways", [(1.0, 1.0), (1.0, -1.0)])
 def test_raw_pictures_become_one_cameras_at_one_instant(ways: tuple[float, float]) -> None:
     pair = made_pair(400)
-    lenses, pictures = _raw(pair, ways)
+    lenses, images = _raw(pair, ways)
+    pictures = list(map(lens_picture, pair, images))
     seam = np.abs(erp_directions(WIDTH)[..., 2]) < np.sin(np.deg2rad(5))
-    found = _off(Stitcher(lenses, 0, _scene()).stitched_raw(pictures, WIDTH), seam)
+    found = _off(Stitcher(lenses, 0, _scene()).stitched(pictures, WIDTH), seam)
     assert max(found) < 0.6
     still = replace(lenses, readout_motion=None)
     for wrong, scene in ((lenses, np.zeros((0, 3))), (still, _scene())):
-        other = _off(Stitcher(wrong, 0, scene).stitched_raw(pictures, WIDTH), seam)
+        other = _off(Stitcher(wrong, 0, scene).stitched(pictures, WIDTH), seam)
         assert min(other) > 3 * max(found)
 
 

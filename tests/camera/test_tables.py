@@ -8,6 +8,7 @@ import pytest
 
 from factors.patch_windows import over_poles
 from gsba.camera.lens import Lenses
+from gsba.camera.pictures import panorama
 from gsba.camera.rig import CubeRig
 from gsba.camera.sphere import around_seam, around_sphere, table
 from gsba.camera.views import ViewCutter, lens_views
@@ -54,9 +55,11 @@ def test_places_are_the_same_band_by_band(monkeypatch: pytest.MonkeyPatch) -> No
     )
     views, scene = lens_views(lenses, 333), np.random.default_rng(1).normal(size=(50, 3))
     erp = np.random.default_rng(2).integers(0, 255, (256, 512, 3), dtype=np.uint8)
-    compute = cubemap._face_maps.__wrapped__  # type: ignore[attr-defined]
-    found = compute(rig, 512, 256), ViewCutter(views, lenses, 0, scene).cut(erp)
+    compute = cubemap._maps.__wrapped__  # type: ignore[attr-defined]
+    picture = panorama(erp, views[0].focal)
+    found = compute(rig, picture.grid), list(ViewCutter(views, lenses, 0, scene).cut([picture]))
     monkeypatch.setattr("gsba.camera.sphere._BAND_ROWS", 1000)
-    assert np.array_equal(compute(rig, 512, 256), found[0])
-    for part, wanted in zip(ViewCutter(views, lenses, 0, scene).cut(erp), found[1], strict=True):
+    assert np.array_equal(compute(rig, picture.grid), found[0])
+    cutter = ViewCutter(views, lenses, 0, scene)
+    for part, wanted in zip(cutter.cut([picture]), found[1], strict=True):
         assert np.array_equal(part, wanted)

@@ -10,6 +10,7 @@ from pixels import pixel_centres
 from scipy.spatial.transform import Rotation
 
 from gsba.camera.lens import Lenses
+from gsba.camera.pictures import panorama
 from gsba.camera.sphere import erp_directions, erp_from_bearings
 from gsba.camera.views import View, ViewCutter, lens_views
 from gsba.demo.render import render_erp
@@ -63,7 +64,7 @@ def _blurred(image: np.ndarray) -> np.ndarray:
 )
 def test_a_view_is_what_its_lens_sees(name: str) -> None:
     view = VIEWS[name]
-    (found,) = ViewCutter((view,), TURNED, 0).cut(_panorama())
+    (found,) = ViewCutter((view,), TURNED, 0).cut([panorama(_panorama(), view.focal)])
     middle = _lens(view)
     middle[:3, 3] = RIG[:3, 3]
     exact, central = _seen(view, _lens(view)), _seen(view, middle)

@@ -25,8 +25,7 @@ from gsba.export.dataset import Dataset, ExportFormat, ExportOptions
 from gsba.export.images import panorama_writer, view_writer, write_pictures
 from gsba.export.pictures import Files
 from gsba.frames import cubemap, load_erp, load_grey, scan
-from gsba.frames.pixels import Buffers, cut_views, load_padded
-from gsba.frames.track_pairs import load_squares
+from gsba.frames.pixels import Buffers, load_padded, pictures_of
 from gsba.log import GsbaError
 from gsba.placement.placement import Placement
 from gsba.types import FACES, FrameSet
@@ -89,7 +88,9 @@ def test_faces_show_the_sphere(frames: FrameSet, rig: CubeRig) -> None:
     assert masks is None
     assert np.abs(images - true).mean() < 0.6
     cutter = ViewCutter(rig_views(rig), ONE_CENTRE, 1)
-    assert np.abs(np.stack(cut_views(frames, 1, cutter)) - true).mean() < 0.7
+    assert (
+        np.abs(np.stack(list(cutter.cut(pictures_of(frames, 1, cutter.focal)))) - true).mean() < 0.7
+    )
 
 
 def test_faces_of_one_lens(frames: FrameSet) -> None:
@@ -97,7 +98,7 @@ def test_faces_of_one_lens(frames: FrameSet) -> None:
     lenses = Lenses(centre=np.array([0, 0, 0.015]), band_rad=float(np.deg2rad(4)))
     views = lens_views(lenses, 64)
     cutter = ViewCutter(views, lenses, 0, 1e6 * np.random.default_rng(0).normal(size=(200, 3)))
-    for view, image in zip(views, cut_views(frames, 0, cutter), strict=True):
+    for view, image in zip(views, cutter.cut(pictures_of(frames, 0, cutter.focal)), strict=True):
         true = colours(view.rays(pixel_centres(view.width, view.height)))
         assert np.abs(image - true).mean() < 0.7
 
@@ -105,7 +106,7 @@ def test_faces_of_one_lens(frames: FrameSet) -> None:
 def test_panoramas_of_two_lenses_are_stitched_in_one_step(frames: FrameSet) -> None:
     lenses = Lenses(centre=np.array([0, 0, 0.015]), band_rad=float(np.deg2rad(4)))
     scene = 1e6 * np.random.default_rng(0).normal(size=(200, 3))
-    found = Stitcher(lenses, 0, scene).stitched_squares(load_squares(frames, 0))
+    found = Stitcher(lenses, 0, scene).stitched(pictures_of(frames, 0), 4 * SIZE)
     assert np.abs(found - _true(4 * SIZE)).mean() < 0.7
 
 

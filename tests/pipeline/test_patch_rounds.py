@@ -49,5 +49,5 @@ def test_a_readout_that_was_taken_back_is_not_looked_for_again(
     state, found = MagicMock(), MagicMock()
     found.lenses, found.estimate.return_value = gone.lenses, gone
     state.map.cameras = [found]
-    monkeypatch.setattr(camera, "_from_patches", MagicMock(side_effect=AssertionError))
+    monkeypatch.setattr(camera, "_estimated", MagicMock(side_effect=AssertionError))
     camera.take_parts_from_patches(state, MagicMock(), "aligned2", 0)
