@@ -124,7 +124,8 @@ def _in_one_place(map_: Map, camera: int) -> bool:
 def _with_seam_bands(state: State, stitched: Sequence[int], prefix: str) -> State:
     """The state without what panoramas of cameras show from between the lenses."""
     for camera in stitched:
-        lenses = _from_features(state, f"{prefix}seam", camera, seam_band.widened, Lenses)
+        given = f"{prefix}seam", camera, _seen_by_features, seam_band.widened, Lenses
+        lenses = _estimated(state, *given)
         state = _with_lenses(state, {camera: lenses})
     return state
 
