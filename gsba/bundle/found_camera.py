@@ -39,6 +39,15 @@ class FoundCamera:
         centres = replace(self.centres, lenses=found.lenses, found=found.lenses.centre)
         return replace(self, centres=centres, readout=found)
 
+    def scaled(self, scale: float) -> "FoundCamera":
+        """The camera in another unit of length: one map unit is `scale` of the new ones."""
+        return replace(
+            self,
+            centres=self.centres and self.centres.scaled(scale),
+            stitch_radius=self.stitch_radius and self.stitch_radius.scaled(scale),
+            readout=self.readout and self.readout.scaled(scale),
+        )
+
     def taken(self, rows: np.ndarray) -> "FoundCamera":
         """The camera of some frames (F',) only."""
         centres, readout = self.centres, self.readout

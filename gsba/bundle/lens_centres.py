@@ -43,6 +43,11 @@ class LensCentres:
     reason: str  # why nothing was taken; empty if it was
     counts: Counts  # of observations
 
+    def scaled(self, scale: float) -> "LensCentres":
+        """The centres in another unit of length: one map unit is `scale` of the new ones."""
+        lenses, covariance = self.lenses.scaled(scale), scale**2 * self.covariance
+        return replace(self, lenses=lenses, found=scale * self.found, covariance=covariance)
+
 
 @dataclass(frozen=True, slots=True)
 class StitchRadius:
@@ -55,6 +60,16 @@ class StitchRadius:
     part_gains: np.ndarray  # (PARTS,) float64, share of the robust cost of each part of the
     # sequence that the radius of the other parts removes, beside centres alone
     reason: str  # why nothing was taken; empty if it was
+
+    def scaled(self, scale: float) -> "StitchRadius":
+        """The radius in another unit of length: one map unit is `scale` of the new ones."""
+        return replace(
+            self,
+            lenses=self.lenses.scaled(scale),
+            centre=scale * self.centre,
+            inverse_stitch_radius=self.inverse_stitch_radius / scale,
+            sigma=self.sigma / scale,
+        )
 
     def on_trial(self, lenses: Lenses) -> Lenses | None:
         """The lenses (solved for without a radius) to solve with before the radius is judged; None

@@ -84,11 +84,11 @@ class JointCameras:
         times, poses = own_timestamps(frames), solution.world_T_rigs
         starts = np.cumsum([0, *(len(run.frames) for run in runs)])
 
-        def estimate(camera: int, known: FoundCamera, scale: float) -> CameraEstimate | None:
-            """In the joint unit, for the frames of all runs; None = one centre, not looked for."""
+        def estimate(camera: int, known: FoundCamera) -> CameraEstimate | None:
+            """For the frames of all runs; None = one centre, not looked for."""
             if not known.lenses:
                 return known.readout
-            found = known.estimate().scaled(scale)
+            found = known.estimate()
             motion, axes = list[np.ndarray](), list[np.ndarray]()
             for n, (run, move) in enumerate(zip(runs, moves, strict=True)):
                 rows, c = np.arange(starts[n], starts[n + 1]), self.in_run(camera, n)
@@ -111,19 +111,11 @@ class JointCameras:
         for camera, number in enumerate(self.seen_by):
             inside = self.in_run(camera, number)
             assert inside is not None
-            known, scale = runs[number].map.cameras[inside], moves[number].scale
-            found, centres = estimate(camera, known, scale), known.centres
-            radius = known.stitch_radius
+            known = runs[number].map.cameras[inside].scaled(moves[number].scale)
+            found, centres = estimate(camera, known), known.centres
             if centres is not None:
-                lenses = Lenses() if found is None else found.lenses
-                covariance, centre = centres.covariance * scale**2, scale * centres.found
-                centres = replace(centres, lenses=lenses, found=centre, covariance=covariance)
-            if radius is not None:
-                inverse, sigma = radius.inverse_stitch_radius / scale, radius.sigma / scale
-                lenses = radius.lenses.scaled(scale)
-                changes = {"lenses": lenses, "inverse_stitch_radius": inverse, "sigma": sigma}
-                radius = replace(radius, **changes)
-            every.append(FoundCamera(centres, known.axes, radius, known.calibrated, found))
+                centres = replace(centres, lenses=Lenses() if found is None else found.lenses)
+            every.append(replace(known, centres=centres, readout=found))
         return tuple(every)
 
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsba.bundle.adjustment import ALIGNED_GATES
+from gsba.bundle.found_camera import FoundCamera
 from gsba.bundle.lens_centres import baseline_of
-from gsba.bundle.readout import CameraEstimate
 from gsba.bundle.trajectory_prior import HeldPoses
 from gsba.config import RefineSettings
 from gsba.features.detection import traits_of
@@ -324,19 +324,19 @@ def _tied_within(state: State, parts: np.ndarray, merged: Registered | None = No
 
 def _with_unit(state: State, scales: np.ndarray, units: Sequence[int]) -> State:
     """Cameras in the unit of maps moved by scales (F,), each in that of a frame `units` (C,)."""
-    if all(one.readout is None for one in state.map.cameras) or not state.map.lenses:
+    if not state.map.lenses:
         return state
-    found = state.map.estimates()
-    each = list[CameraEstimate]()
-    for one, frame in zip(found.each, units, strict=True):
+    factors = np.repeat(np.column_stack([np.ones(len(scales)), scales]), 3, axis=1)
+    cameras = list[FoundCamera]()
+    for one, frame in zip(state.map.cameras, units, strict=True):
         scaled, motion = one.scaled(float(scales[frame])), one.lenses.readout_motion
         if motion is not None:
-            factors = np.repeat(np.column_stack([np.ones(len(motion)), scales]), 3, axis=1)
-            lenses = replace(scaled.lenses, readout_motion=motion * factors)
-            scaled = replace(scaled, lenses=lenses)
-        each.append(scaled)
-    moved = found.with_each(each)
-    return state.with_cameras(moved).through(moved.cameras)
+            found = scaled.estimate()
+            lenses = replace(found.lenses, readout_motion=motion * factors)
+            scaled = scaled.with_estimate(replace(found, lenses=lenses))
+        cameras.append(scaled)
+    moved = replace(state.map, cameras=tuple(cameras))
+    return replace(state, map=moved).through(moved.lenses)
 
 
 def _check_unit(

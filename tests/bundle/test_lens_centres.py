@@ -21,6 +21,7 @@ from synthetic import World
 
 from factors import RobustLoss, bearing_residuals
 from gsba.bundle import adjustment, lens_centres
+from gsba.bundle.found_camera import FoundCamera
 from gsba.bundle.lens_centres import LensCentres, StitchRadius
 from gsba.bundle.optimizer import SolverOptions
 from gsba.bundle.readout import CameraEstimate
@@ -119,6 +120,23 @@ def test_a_stitch_radius_is_judged_by_what_is_solved_with_it(inverse: float) -> 
     scale = pose_similarity(solved.world_T_rigs, world.world_T_rigs).scale
     assert bool(found.reason) == (inverse == 0) == (found.lenses.inverse_stitch_radius == 0)
     assert abs(found.inverse_stitch_radius - scale * inverse) < 4 * found.sigma < 0.05
+
+
+def test_another_unit_of_length_changes_a_camera_with_all_its_errors() -> None:
+    world, shown, found, solved = _of_two(0.05, 0)
+    lenses = found.lenses
+    points = placed(solved, shown, Cameras((lenses,)).clear(world.tracks, shown))
+    around = replace(solved, landmarks=points)
+    given = around, Cameras((lenses,)).seen(shown), problem_of(world), lenses, shown.bearings_rig
+    radius = lens_centres.stitched_for(ObservedRays(*given))
+    camera = FoundCamera(found, stitch_radius=radius).scaled(3.0)
+    assert camera.centres is not None and camera.stitch_radius is not None
+    length, sigma = np.array(lens_centres.baseline_of(camera.centres, 1.0))
+    np.testing.assert_allclose((length, sigma), lens_centres.baseline_of(found, 3.0))
+    assert camera.lenses.baseline == pytest.approx(3 * lenses.baseline)
+    significance = camera.stitch_radius.inverse_stitch_radius / camera.stitch_radius.sigma
+    assert significance == pytest.approx(radius.inverse_stitch_radius / radius.sigma)
+    assert camera.stitch_radius.sigma == pytest.approx(radius.sigma / 3)
 
 
 def test_what_is_asked_for_is_taken_and_too_little_is_named() -> None:
