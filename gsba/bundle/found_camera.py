@@ -15,7 +15,7 @@ from gsba.camera.lens import Lenses
 class FoundCamera:
     """One camera of a map, as estimates have found it."""
 
-    centres: LensCentres | None = None  # of the lenses that see it; None = not looked for
+    centres: LensCentres | None = None  # of the lenses; None = not looked for
     axes: LensAxes | None = None  # where these look; None = not looked for
     stitch_radius: StitchRadius | None = None  # of panoramas; None = not looked for
     calibrated: SelfCalibration | None = None  # of raw pairs; None = not looked for
@@ -23,7 +23,7 @@ class FoundCamera:
 
     @property
     def lenses(self) -> Lenses:
-        """What sees the observations."""
+        """The camera's lenses; one centre where none were looked for."""
         return Lenses() if self.centres is None else self.centres.lenses
 
     def estimate(self) -> CameraEstimate:

@@ -15,6 +15,7 @@ from gsba.bundle.shared_parameters import (
     ObservedRays,
     SharedModel,
     cross_validate,
+    damped,
     models_of,
     newton_step,
     predicts,
@@ -104,8 +105,7 @@ def estimate(rays: ObservedRays) -> LensCentres:
         unknown, nothing = np.full((num, num), np.nan), np.full(PARTS, np.nan)
         why = "too few points to tell one lens from the other"
         return LensCentres(so_far, so_far.centre, unknown, nothing, why, counts)
-    damping = 1e-9 * np.trace(total.hessian) * np.eye(len(total.hessian))
-    covariance = np.linalg.inv(total.hessian + damping) / total.curvature
+    covariance = np.linalg.inv(damped(total.hessian)) / total.curvature
     found = so_far.centre + _step([total])
     at_one = -so_far.centre  # as if there were one centre
     verdict = cross_validate(systems, _step, lambda _: at_one)
@@ -196,7 +196,6 @@ _step = partial(newton_step, curved=True)
 def _step_to(systems: Sequence[SharedModel], last: float) -> np.ndarray:
     """As `_step`, where the last parameter changes by `last`."""
     total = summed(systems)
-    hessian = total.curvature * total.hessian
-    hessian += 1e-9 * np.trace(hessian) * np.eye(len(hessian))
+    hessian = damped(total.curvature * total.hessian)
     rest = -np.linalg.solve(hessian[:-1, :-1], total.gradient[:-1] + last * hessian[:-1, -1])
     return np.r_[rest, last]

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsba.bundle.shared_parameters import ObservedRays, models_of, summed
+from gsba.bundle.shared_parameters import ObservedRays, damped, models_of, summed
 from gsba.camera.lens import Lenses, seam_sines
 
 logger = logging.getLogger(__name__)
@@ -39,8 +39,7 @@ def widened(rays: ObservedRays) -> Lenses:
     if not systems:
         return lenses
     total = summed(systems)
-    hessian = total.curvature * total.hessian
-    covariance = np.linalg.inv(hessian + 1e-9 * np.trace(hessian) * np.eye(len(hessian)))
+    covariance = np.linalg.inv(damped(total.curvature * total.hessian))
     outwards, variances = -covariance @ total.gradient, np.diagonal(covariance)
     short = outwards[-1] - outwards[:-1]  # beside rays that are far from the seam
     sigmas = np.sqrt(variances[:-1] + variances[-1] - 2 * covariance[:-1, -1])

@@ -110,8 +110,12 @@ def newton_step(models: Sequence[SharedModel], *, curved: bool) -> np.ndarray:
     into account or not."""
     total = summed(models)
     hessian = (total.curvature if curved else 1.0) * total.hessian
-    damping = 1e-9 * np.trace(hessian) * np.eye(len(hessian))
-    return -np.linalg.solve(hessian + damping, total.gradient)
+    return -np.linalg.solve(damped(hessian), total.gradient)
+
+
+def damped(hessian: np.ndarray) -> np.ndarray:
+    """A Hessian (K, K) that can be inverted, also where nothing depends on a parameter."""
+    return hessian + max(1e-9 * np.trace(hessian), 1e-300) * np.eye(len(hessian))
 
 
 def drawn(landmarks: Landmarks, most: int, seed: int) -> Landmarks:

@@ -72,7 +72,7 @@ class Map:
 
     @property
     def lenses(self) -> Cameras:
-        """What sees the observations."""
+        """Lenses of all cameras."""
         return Cameras(tuple(one.lenses for one in self.cameras), self.of_frame)
 
     def keypoints(self, rig: CubeRig) -> Keypoints:

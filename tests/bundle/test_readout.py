@@ -70,6 +70,18 @@ def test_velocities_do_not_span_maps() -> None:
     np.testing.assert_allclose(found, np.concatenate(halves), atol=1e-9)
 
 
+def test_no_duration_is_found_where_no_neighbour_in_time_tells_how_frames_move() -> None:
+    """Frames of two maps that take turns."""
+    world, shown = seen_through(LENSES, 0)
+    start = Solution.without_points(world.world_T_rigs)
+    solved, keypoints, tracks = solved_under(world, shown, LENSES, start)
+    around, problem = placed(solved, keypoints, tracks), problem_of(world)
+    problem = replace(problem, maps=np.arange(len(world.world_T_rigs)) % 2)
+    given = keypoints, problem, LENSES, shown.bearings_rig, times(len(world.world_T_rigs))
+    found = readout.estimate(ObservedRays(replace(solved, landmarks=around), *given))
+    assert found.reason and found.lenses.readout_motion is None
+
+
 def test_the_duration_is_found_in_two_maps_of_one_recording() -> None:
     sweeping = replace(LENSES, row_directions=SWEEPS, readout_motion=TWISTS)
     world, shown = seen_through(sweeping, 0)
