@@ -171,13 +171,15 @@ class PerspectiveProjection(RadialProjection):
         return np.tan(angles)[:, None] ** np.arange(3, 3 + 2 * len(self.radial), 2)
 
     def unproject(self, pixels: np.ndarray) -> np.ndarray:
-        """See `Projection`; Newton's steps are taken in the tangent, which is nearly linear."""
+        """See `Projection`; Newton's steps are taken in the tangent, which is nearly linear. Pixels
+        that no direction reaches get one anyway, never NaN."""
         away = (pixels - np.asarray(self.principal)) / self.focal
         radii = np.hypot(away[..., 0], away[..., 1])
         tangents = radii.copy()
         for _ in range(_NUM_NEWTON_STEPS):
             reached, slope = _odd_polynomial(tangents, self.radial)
             tangents = tangents - (reached - radii) / np.maximum(slope, _MIN_SLOPE)
+            tangents = np.clip(tangents, 0, np.tan(self.max_angle))
         scale = np.divide(tangents, radii, out=np.ones_like(radii), where=radii > 0)
         rays = np.concatenate([scale[..., None] * away, np.ones_like(radii)[..., None]], axis=-1)
         return unit(rays)

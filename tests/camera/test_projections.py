@@ -73,6 +73,14 @@ def test_a_perspective_lens_is_that_of_opencv() -> None:
     assert np.isnan(lens.project(np.array([[0.1, 0.0, -1.0]]))).all()
 
 
+def test_pixels_that_no_direction_reaches_get_one_anyway() -> None:
+    """The radius of this estimate, of a cropped photo, turns back 243 pixels from its middle."""
+    lens = PerspectiveProjection(500, 400, 72.5, (250.0, 200.0), (0.0233, -0.0022))
+    pixels = np.stack(np.meshgrid(np.arange(0.5, 500), np.arange(0.5, 400)), axis=-1)
+    directions = lens.unproject(pixels)
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=-1), 1.0, atol=1e-12)
+
+
 def test_calibrations_name_known_projections() -> None:
     assert projection_of_model("Kannala-Brandt: r = f (th + ...)") is FisheyeProjection
     with pytest.raises(ValueError, match="'wavy', which is none of kannala-brandt"):
