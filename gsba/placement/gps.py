@@ -240,15 +240,16 @@ def _checked_fixes(
     settings: GpsSettings,
 ) -> GpsFixes:
     """Fixes of a file; `noise` holds a row of `_NOISE_COLUMNS` for each."""
-    if not isinstance(keys[0], str) and len(set(keys)) < len(keys):
-        times = np.array(keys, np.float64)
-        order = np.argsort(times, kind="stable")
-        same = int(np.flatnonzero(np.diff(times[order]) == 0)[0])
-        one, other = int(order[same]), int(order[same + 1])
-        raise GsbaError(
-            f"{path} holds two positions at one time, {keys[one]!r} s: positions {one + 1} and "
-            f"{other + 1}; remove one of them"
-        )
+    first = dict[float | str, int]()  # position of each key
+    for row, key in enumerate(keys, 1):
+        if (before := first.setdefault(key, row)) != row:
+            where = (
+                f"of frame '{brief(key)}'" if isinstance(key, str) else f"at one time, {key!r} s"
+            )
+            raise GsbaError(
+                f"{path} holds two positions {where}: positions {before} and {row}; remove one of "
+                "them"
+            )
     if not isinstance(keys[0], str):
         keys = [float(key) + settings.offset_s for key in keys]
     dop, dop_up, error, error_up = np.array(noise).T

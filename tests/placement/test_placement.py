@@ -314,6 +314,7 @@ def test_without_edges_the_rigs_decide(tmp_path: Path) -> None:
         ("time,lat,lon\n1,north,3\n", "latitude 'north' is not a number"),
         ("time,lat,lon\n1,95,3\n", "are out of range"),
         ("time,lat,lon\n1,5,3\n1,5,4\n", "two positions at one time"),
+        ("name,lat,lon\na,5,3\nb,5,4\na.jpg,6,4\n", "of frame 'a': positions 1 and 3; remove one"),
         ("time,lat,lon\n900,5,3\n901,5,4\n", "no overlap in time"),
         ("name,lat,lon\nelsewhere,5,3\n", "0 of its positions are of refined frames"),
         ("$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47", "is an NMEA log;"),
