@@ -39,6 +39,7 @@ _MAX_LENS_SCALE_SIGMA = 0.1  # relative, of a scale by the lenses
 _MAX_GPS_ANGLE_SIGMA_DEG = 25.0  # of heading and tilt by GPS
 _MAX_SCALE_SIGMAS = 4.0  # of two scales that agree: true ones differ by more once in 16,000 runs
 _NUM_NAMED = 5  # false positions that a message names
+_UPSIDE_DOWN = -0.5  # vertical component of the cameras' up axes: 120 degrees from up
 _MIN_EXTENT_RATIO = 0.02  # of a path's second extent to its first: less determines no roll
 
 
@@ -291,6 +292,14 @@ def _on_earth(
                 "one of --gps and --scale lens"
             )
     fit = dataclasses.replace(found.similarity, rotation=found.similarity.rotation @ level)
+    ups = -reconstruction.world_T_rigs[fixes.frames, :3, 1] @ fit.rotation.T
+    if np.median(ups[:, 2]) < _UPSIDE_DOWN:
+        logger.warning(
+            "--gps %s: the placed run is upside down: in the file, latitude and longitude are "
+            "swapped, or a direction is reversed, unless the camera hung head down; --up auto "
+            "refuses such positions",
+            path,
+        )
     sigmas = found.position_sigmas(positions @ level.T)
     grounds = {
         **upright.grounds,

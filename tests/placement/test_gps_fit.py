@@ -183,6 +183,21 @@ def test_a_straight_path_is_placed_where_up_is_known(
     np.testing.assert_allclose(placed.similarity.rotation, Y_DOWN, atol=2e-5)
 
 
+def test_swapped_columns_turn_the_run_upside_down(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A level walk fits a mirror image upside down: how the camera was held tells."""
+    frames, true = frame_set(40), _walk(40, 80.0)
+    result = _result(true @ Y_DOWN)
+    result.world_T_rigs[:, :3, :3] = np.eye(3)
+    file = Path(_table(tmp_path / "gps.csv", frames, true))
+    place(result, frames, PlacementSettings(gps=str(file)))
+    assert not caplog.records
+    file.write_text(file.read_text().replace("lat,lon", "lon,lat"))
+    place(result, frames, PlacementSettings(gps=str(file)))
+    assert "the placed run is upside down" in caplog.text
+
+
 def test_the_date_line_is_no_jump(tmp_path: Path, upright: PlacementSettings) -> None:
     frames, true = frame_set(40), _walk(40, 80.0)
     rows = ["name,lat,lon,alt"]
