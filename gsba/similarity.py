@@ -202,6 +202,17 @@ def residuals_of(fit: Sim3, source: np.ndarray, target: np.ndarray) -> np.ndarra
     return np.linalg.norm(fit.points(source) - target, axis=1)
 
 
+def is_mirrored(source: np.ndarray, target: np.ndarray) -> bool:
+    """True if points (N, 3) fit a mirror image of the targets at least twice as well, by the RMS of
+    residuals. Plane and straight paths, and three points, fit both alike."""
+    own, mirrored = (
+        residuals_of(similarity(source, ends), source, ends)
+        for ends in (target, target * [-1.0, 1.0, 1.0])
+    )
+    extent = extent_of(target)
+    return bool(np.sum(own**2) > 4 * np.sum(mirrored**2) + len(source) * (1e-9 * extent) ** 2)
+
+
 def extents(positions: np.ndarray) -> np.ndarray:
     """Extents (3,) along the principal axes, as parts of the largest."""
     values = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False)

@@ -1,6 +1,7 @@
 """Commands on finished runs: `export`, `evaluate`."""
 
 import json
+import logging
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
     from gsba.evaluate.consistency import Consistency
     from gsba.export import Shutter
     from gsba.types import FrameSet, Reconstruction, Trajectory
+
+logger = logging.getLogger(__name__)
 
 
 @command
@@ -212,6 +215,7 @@ def evaluate(
     from gsba.evaluate.pixels import depth_maps, induced_errors
     from gsba.evaluate.trajectory import evaluate as compare
     from gsba.evaluate.trajectory import format_table
+    from gsba.evaluate.truth_check import fault_of_truth
     from gsba.store.folder import refuse_foreign
     from gsba.trajectory.files import read_trajectory
 
@@ -233,6 +237,8 @@ def evaluate(
         text = json.dumps(content, indent=1) + "\n"
         write_text(json_file, text)
     typer.echo(format_table({estimate.name: errors}))
+    if fault := fault_of_truth(found, true):
+        logger.warning("--truth %s: %s", truth, fault)
     if induced is not None:
         typer.echo(
             "induced error, in pixels of a panorama four times as wide as the depth maps: median "

@@ -21,6 +21,7 @@ from gsba.scans.types import Scan, cloud_of
 from gsba.similarity import (
     Sim3,
     extents,
+    is_mirrored,
     naming,
     pose_similarity,
     residuals_of,
@@ -401,6 +402,11 @@ def _aligned(reconstruction: Reconstruction, frames: FrameSet, path: Path) -> Pl
             fit, used = robust_similarity(source, target, similarity, 3, *limits)
     residuals = residuals_of(fit, source, target)
     _require_majority(path, used, residuals, frames, rows, "its positions count as exact")
+    if is_mirrored(source[used], target[used]):
+        raise GsbaError(
+            f"{path}: a mirror image of its positions fits at least twice as well: its world is "
+            "left-handed; reverse or swap one of its axes"
+        )
     sigma = float(np.sqrt(np.mean(residuals[slice(None) if straight else used] ** 2)))
     grounds = {"file": str(path), "poses": len(rows), "outliers": int(np.sum(~used)), "rmse": sigma}
     unit = "units of the true poses"

@@ -210,6 +210,15 @@ def test_truth_of_a_straight_walk_takes_the_roll_from_orientations(tmp_path: Pat
     np.testing.assert_allclose(placed.apply(result).world_T_rigs, true, atol=1e-9)
 
 
+def test_mirrored_truth_is_refused(tmp_path: Path) -> None:
+    result, frames = walk_result(), frame_set(40)
+    true = Placement(Sim3(1 / 0.21)).apply(result).world_T_rigs
+    true[:, :3, 3] *= [1, 1, -1]
+    write_tum(tmp_path / "truth.tum", Trajectory(frames.timestamps, true))
+    settings = PlacementSettings(align=str(tmp_path / "truth.tum"))
+    refused("a mirror image of its positions fits", place, result, frames, settings)
+
+
 @pytest.mark.parametrize("up", ["none", "auto"])
 def test_a_stuck_receiver_is_refused(
     tmp_path: Path, up: str, monkeypatch: pytest.MonkeyPatch
