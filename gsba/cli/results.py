@@ -62,6 +62,10 @@ def export(
     from gsba.store.finished import load_run
     from gsba.store.folder import claim
 
+    if baseline is not None and scale != "lens":
+        raise GsbaError("--baseline is for --scale lens: give that as well")
+    if gps is None and (gps_sigma, gps_offset) != (None, None):
+        raise GsbaError("--gps-sigma and --gps-offset are of positions: give --gps FILE as well")
     name, to = to, format_of(to)
     options = options_for(name, ExportOptions(face_size, link=link, images=images), masks)
     world = {"up": up, "length": _length(scale), "between": between, "gps": gps, "align": align}
@@ -201,6 +205,13 @@ def evaluate(
     if splat:
         settings = splat_settings(iterations, face_size, backend, max_gaussians)
         evaluate_splat(estimate, against or [], settings, lpips or [])
+    elif against or lpips or backend != "auto" or any((iterations, face_size, max_gaussians)):
+        raise GsbaError(
+            "--against, --iterations, --face-size, --max-gaussians, --backend and --lpips are of "
+            "splats: give --splat as well"
+        )
+    if depth is not None and truth is None:
+        raise GsbaError("--depth measures errors of poses: give --truth FILE as well")
     known = {name: str(x) for name, x in (("pairs", pairs), ("gps", gps), ("up", up)) if x}
     if scan is not None:
         _against_scan(estimate, scan, known, json_file if truth is None else None)

@@ -199,6 +199,12 @@ def _require_fitting(to: ExportFormat, frames: FrameSet, options: ExportOptions)
         )
     if options.exposures and to not in (ExportFormat.COLMAP, ExportFormat.COLMAP_FLAT):
         raise GsbaError(f"exposures go with colmap and colmap-flat, not with {to.value}")
+    if options.split and to not in (ExportFormat.COLMAP_FLAT, ExportFormat.NERFSTUDIO):
+        raise GsbaError(
+            f"--split holds panoramas out in colmap-flat and nerfstudio, not in {to.value}"
+        )
+    if options.shutter.exposure_s is not None and to != ExportFormat.NERFSTUDIO:
+        raise GsbaError(f"--exposure-ms goes with nerfstudio, 3dgs-deblur, not with {to.value}")
     if photos.photos and not with_faces:
         raise GsbaError(
             f"photos go beside cube faces in {', '.join(FITTING)}, not in {to.value} with "

@@ -3,6 +3,7 @@
 (its height in the picture - 1/2) rolling_shutter_time after the pose, and blurred over
 exposure_time."""
 
+import logging
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +12,8 @@ import numpy as np
 from gsba.camera.cameras import Cameras
 from gsba.geometry import CV_R_GL, inverse
 from gsba.types import FrameSet, Reconstruction
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +46,11 @@ def rig_velocities(
     steps = np.diff(frames.timestamps)
     # seconds: poses further apart do not tell how fast the camera moves in between
     if len(steps) < 2 or steps.max() > 0.25:
+        if shutter.exposure_s is not None:
+            logger.warning(
+                "the exposure is not written: how the camera moves meanwhile is not known, as the "
+                "run found no readout and frames are more than a quarter of a second apart"
+            )
         return None
     from scipy.spatial.transform import Rotation
 

@@ -161,6 +161,23 @@ def test_export_checks_its_options(tmp_path: Path) -> None:
     fails(run_gsba("export", tmp_path, "--to", "ply", "--gps", ""), 'gps = "" is not allowed')
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("export", "run", "--to", "tum", "--baseline", 32), "--baseline is for --scale lens"),
+        (("export", "run", "--to", "tum", "--gps-sigma", 1), "give --gps FILE as well"),
+        (("export", "run", "--to", "tum", "--gps-offset", 0), "give --gps FILE as well"),
+        (("evaluate", "run", "--truth", "t", "--against", "b"), "give --splat as well"),
+        (("evaluate", "run", "--truth", "t", "--iterations", 9), "give --splat as well"),
+        (("evaluate", "run", "--scan", "s", "--depth", "d"), "give --truth FILE as well"),
+    ],
+)
+def test_options_without_the_one_they_belong_to_are_refused(
+    arguments: tuple[object, ...], message: str
+) -> None:
+    fails(run_gsba(*arguments), message)
+
+
 def test_evaluate_compares_a_file_or_a_run(tmp_path: Path) -> None:
     truth = _tum(tmp_path / "truth.tum")
     (tmp_path / "run").mkdir()

@@ -266,6 +266,12 @@ def test_unknown_names_are_refused() -> None:
     refused(r"supersplat: it edits splats.*point_cloud.ply", format_of, "supersplat")
 
 
+def test_an_exposure_for_a_format_without_one_is_refused(tmp_path: Path) -> None:
+    given, choices = (reconstruction(), panoramas(tmp_path / "frames")), {"shutter": Shutter(0, 1)}
+    message = "--exposure-ms goes with nerfstudio, 3dgs-deblur, not with colmap"
+    refused(message, export, *given, tmp_path / "out", ExportFormat.COLMAP, **choices)
+
+
 def test_velocities_say_where_neighbouring_frames_are(tmp_path: Path) -> None:
     """A camera that turns and moves steadily: each face is where its velocity puts it."""
     frames = panoramas(tmp_path / "frames")
@@ -287,8 +293,12 @@ def test_velocities_say_where_neighbouring_frames_are(tmp_path: Path) -> None:
         np.testing.assert_allclose(moved_by_velocities(before, 0.01), wanted, atol=2e-4)
 
 
-def test_frames_far_apart_have_no_velocities(tmp_path: Path) -> None:
-    frames = panoramas(tmp_path / "frames")  # half a second apart
-    export(reconstruction(), frames, tmp_path / "out", ExportFormat.NERFSTUDIO, face_size=32)
+def test_frames_far_apart_have_no_velocities(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    frames, shutter = panoramas(tmp_path / "frames"), Shutter(exposure_s=0.005)  # half a second
+    to, size = ExportFormat.NERFSTUDIO, 32
+    export(reconstruction(), frames, tmp_path / "out", to, face_size=size, shutter=shutter)
+    assert "the exposure is not written" in caplog.text
     meta = json.loads((tmp_path / "out/transforms.json").read_text())
     assert "exposure_time" not in meta and "camera_linear_velocity" not in meta["frames"][0]

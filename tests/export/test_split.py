@@ -62,6 +62,9 @@ def test_a_split_that_is_asked_for_is_not_dropped(tmp_path: Path) -> None:
     for to in (ExportFormat.COLMAP_FLAT, ExportFormat.NERFSTUDIO):
         with pytest.raises(GsbaError, match=r"2 refined panoramas are too few.*use --no-split"):
             export(scene, frames, out, to, face_size=16, split=True)
+    for to in set(ExportFormat) - {ExportFormat.COLMAP_FLAT, ExportFormat.NERFSTUDIO}:
+        with pytest.raises(GsbaError, match=f"colmap-flat and nerfstudio, not in {to.value}"):
+            export(scene, frames, out, to, split=True)
     assert [path.name for path in tmp_path.iterdir()] == ["frames"]
 
 
