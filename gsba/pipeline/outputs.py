@@ -28,7 +28,7 @@ from gsba.report.report import Findings, StageLog, build_report, plain, write_po
 from gsba.report.verdict import Level
 from gsba.store.store import RunStore
 from gsba.trajectory.files import write_tum
-from gsba.types import CoarsePoses, Counts, FrameSet, Reconstruction, Trajectory
+from gsba.types import CoarsePoses, Counts, FrameSet, Reconstruction, RunStart, Trajectory
 
 CALIBRATION = "calibration.json"
 TRAJECTORIES = "trajectories"  # folder of a trajectory file for each of several recordings
@@ -231,6 +231,8 @@ def _gauge(run: Run, prior: Prior) -> str:
     if fixing:
         names = ", ".join(family.name for family in fixing)
         world = f"families {names} fix the world or the scale"
+    elif run.evidence.start == RunStart.EARLIER_RUN:
+        world = "the world and scale of the run that it started from, of several the first"
     elif prior.absent:
         world = (
             "no trajectory: the first frame's axes, and the median step of the start as the unit"

@@ -267,6 +267,8 @@ def test_a_recording_is_taken_out_again(grown: Path, home: GrowingHome, tmp_path
     assert images == {"ground"}
     assert len(load_run(tmp_path / "run-before")[1]) == 2 * NUM
     assert "upper" not in (run / "gsba.json").read_text()
+    report = json.loads((run / "report.json").read_text())
+    assert report["gauge"].startswith("the world and scale of the run that it started from")
 
 
 def test_merge_and_remove_refuse_in_one_line(
