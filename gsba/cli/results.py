@@ -300,10 +300,16 @@ def _consistency(run: Path, truth: "Trajectory") -> "tuple[Consistency | None, s
     """Consistency of a run's covariances with its errors, and a text; None where unknown."""
     from gsba.evaluate.consistency import consistency_of, format_consistency
     from gsba.store.finished import load_run
+    from gsba.trajectory.association import refuse_untimed
 
+    cannot = "covariances cannot be checked"
     try:
         reconstruction, frames = load_run(run)
+    except GsbaError as error:
+        return None, f"{cannot}: {error}"
+    refuse_untimed(frames, truth)
+    try:
         found = consistency_of(reconstruction, frames.timestamps, truth)
     except GsbaError as error:
-        return None, f"covariances cannot be checked: {error}"
+        return None, f"{cannot}: {error}"
     return found, "\ncovariances\n" + format_consistency(found, frames.names.__getitem__)

@@ -25,7 +25,7 @@ from gsba.splat.scene import load_faces, make_views, split_frames, start_cloud
 from gsba.splat.scores import Distance, Score, mean_score, measure
 from gsba.splat.train import Images, Views, near_of, train
 from gsba.store.store import digest, fingerprint
-from gsba.trajectory.association import matched_in_time
+from gsba.trajectory.association import matched_in_time, refuse_untimed
 from gsba.types import FrameSet, PoseStatus, Reconstruction, Trajectory
 
 if TYPE_CHECKING:
@@ -48,7 +48,8 @@ class SourceResult:
 
 def poses_for(frames: FrameSet, trajectory: Trajectory) -> np.ndarray:
     """Pose (F, 4, 4) of each frame by time; NaN where the trajectory has none. Raises GsbaError: no
-    pose is within the tolerance of a frame's time."""
+    pose is within the tolerance of a frame's time, or frames have none."""
+    refuse_untimed(frames, trajectory)
     expected = Trajectory(frames.timestamps, np.tile(np.eye(4), (len(frames), 1, 1)))
     rows, which = matched_in_time(trajectory, expected, TOLERANCE_S)
     if len(which) == 0:

@@ -16,7 +16,7 @@ from gsba.report.html.figures import viewing_axes
 from gsba.report.report import angular_residuals, frame_quality
 from gsba.similarity import NoSimilarityError, Sim3, pose_similarity
 from gsba.store.finished import load_run
-from gsba.trajectory.association import matched_in_time
+from gsba.trajectory.association import matched_in_time, refuse_untimed
 from gsba.trajectory.files import read_trajectory
 from gsba.types import Trajectory, rows_across
 
@@ -50,16 +50,18 @@ def load(paths: Sequence[Path], truth: Trajectory | None = None) -> tuple[Plotte
         GsbaError: a run cannot be read, or has too few poses in common with the truth.
     """
     names = _names(paths)
-    found = [_read(name, path) for name, path in zip(names, paths, strict=True)]
+    found = [_read(name, path, truth) for name, path in zip(names, paths, strict=True)]
     if truth is None:
         return tuple(replace(one, placed=_aligned_to(one, found[0])) for one in found)
     return tuple(_with_errors(one, truth) for one in found)
 
 
-def _read(name: str, path: Path) -> PlottedRun:
+def _read(name: str, path: Path, truth: Trajectory | None) -> PlottedRun:
     if not path.is_dir():
         return PlottedRun(name, read_trajectory(path))
     reconstruction, frames = load_run(path)
+    if truth is not None:
+        refuse_untimed(frames, truth)
     coarse, start = path / "coarse.tum", ""
     with suppress(OSError, ValueError, KeyError):  # of an older run
         start = f" ({json.loads((path / 'report.json').read_text(encoding='utf-8'))['start']})"

@@ -254,6 +254,21 @@ def matched_in_time(
     return finite[nearest_e[rows_t]], rows_t
 
 
+def refuse_untimed(frames: FrameSet, trajectory: Trajectory) -> None:
+    """Refuse poses at times beside frames that have none: these count as 0, 1, 2, ... seconds.
+
+    Poses at whole seconds may be numbered likewise, as KITTI's.
+
+    Raises:
+        GsbaError: no frame has a time, and a pose is between whole seconds.
+    """
+    if not frames.timed_frames.any() and (trajectory.timestamps % 1 != 0).any():
+        raise GsbaError(
+            "the frames have no times to match true poses with: refine with --timestamps FILE or "
+            "--fps F"
+        )
+
+
 def follow_keyframes(frames: Trajectory, keyframes: Trajectory) -> Trajectory:
     """Frame poses corrected by the keyframes around them.
 

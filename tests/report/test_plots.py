@@ -3,6 +3,7 @@
 import re
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,12 +15,14 @@ from scipy.spatial.transform import Rotation
 from tiny_run import Case
 
 from gsba.evaluate import charts
-from gsba.evaluate.splats import SourceResult, _write_curves
+from gsba.evaluate.splats import SourceResult, _write_curves, poses_for
 from gsba.evaluate.trajectory import evaluate
 from gsba.geometry import pose
 from gsba.report.plots import _errors, _residuals, _shares, _trajectories, draw, load
 from gsba.similarity import Sim3
 from gsba.splat.scores import Score
+from gsba.store.finished import load_run
+from gsba.trajectory.association import refuse_untimed
 from gsba.trajectory.files import read_trajectory, write_tum
 from gsba.types import Trajectory
 
@@ -73,6 +76,24 @@ def test_runs_are_laid_on_the_truth_with_the_errors_that_evaluate_has(
     np.testing.assert_array_equal(before.get_ydata(), run.coarse_errors.positions)
     assert panels[0].get_yscale() == "log" and after.get_xdata()[0] == 0
     assert "units of the truth" in panels[0].get_ylabel()
+
+
+def test_frames_without_times_are_not_compared_by_time(
+    case: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They are numbered from 0, as true poses in a file without times are."""
+    found, frames = load_run(case.out)
+    untimed = replace(frames, timed=False)
+    for module in ("gsba.store.finished", "gsba.report.plots"):
+        monkeypatch.setattr(f"{module}.load_run", lambda *_: (found, untimed))
+    later = Trajectory(case.truth.timestamps + 0.001, case.truth.world_T_rigs)
+    message = "the frames have no times to match true poses with"
+    refused(message, load, [case.out], later)
+    refused(message, poses_for, untimed, later)
+    path = _written(tmp_path / "truth.tum", later)
+    fails(run_gsba("evaluate", case.out, "--truth", path), message)
+    numbered = np.arange(len(case.truth.timestamps), dtype=np.float64)
+    refuse_untimed(untimed, Trajectory(numbered, case.truth.world_T_rigs))
 
 
 def test_residuals_are_those_of_the_report(case: Case) -> None:
