@@ -109,7 +109,7 @@ def localize(
     for frame in found.frames:
         if not frame.found:
             typer.echo(f"{frame.name}: not localised: {frame.reason}", err=True)
-    write_localized(out, run, found, pictures)
+    write_localized(out, localizer.map, found, pictures)
     num = sum(frame.found for frame in found.frames)
     typer.echo(f"{num} of {len(pictures)} pictures localised: {out}")
     if num < 0.9 * len(pictures) and not allow_partial:

@@ -59,7 +59,7 @@ def export(
     from gsba.export.trainers import format_of, how_to_start, options_for
     from gsba.placement.placement import place
     from gsba.store.cluster import connected, hired
-    from gsba.store.finished import load_run
+    from gsba.store.finished import load_run, map_digest
     from gsba.store.folder import claim
 
     if baseline is not None and scale != "lens":
@@ -83,7 +83,7 @@ def export(
         placement=placed,
         lenses=lenses,
         without=_left_out(run, frames, without or ()),
-        photos=read_photos(photos, run),
+        photos=read_photos(photos, run, map_digest(reconstruction, frames)),
         shutter=shutter_of(run, exposure_ms),
         split=split,
         depths=depths,

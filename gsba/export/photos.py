@@ -25,15 +25,16 @@ LIST = "localized.json"  # of `gsba localize`, in its folder
 _INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "p1", "p2")
 
 
-def read_photos(folder: Path | None, run: Path) -> Photos:
-    """The photos that `gsba localize` found in a run.
+def read_photos(folder: Path | None, run: Path, digest: str) -> Photos:
+    """The photos that `gsba localize` found in a run's map.
 
     Args:
         folder: that `gsba localize` wrote; None = no photos.
+        digest: of the map as it is now, see `gsba.store.finished.map_digest`.
 
     Raises:
-        GsbaError: the folder holds no list of localised photos, or one of another run; a photo is
-            gone.
+        GsbaError: the folder holds no list of localised photos, or one of another run or map, or of
+            the run before it changed; a photo is gone.
     """
     if folder is None:
         return Photos()
@@ -50,11 +51,16 @@ def read_photos(folder: Path | None, run: Path) -> Photos:
             for entry in content["pictures"]
             if entry["camera"] is not None and not entry["reason"]
         )
-        own = Path(content["run"])
+        own, known = Path(content["run"]), content["map"]
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecordError) as error:
         raise GsbaError(f"{path} is no list of gsba localize ({error}): localise again") from None
     if own.resolve() != run.resolve():
         raise GsbaError(f"{folder}: its photos are localised in {own}, not in {run}")
+    if known != digest:
+        raise GsbaError(
+            f"{folder}: its photos are localised in another map of {run}, or before it changed: "
+            "localise again"
+        )
     if not photos:
         raise GsbaError(f"{folder} holds no localised photo")
     for photo in photos:

@@ -11,6 +11,8 @@ from gsba.geometry import quaternion_from_rotation
 from gsba.localization.localizer import LocalizedFrame
 from gsba.localization.photo_localizer import CameraOfPhotos, LocalizedPhotos
 from gsba.localization.pictures import QueryPicture
+from gsba.localization.run_map import RunMap
+from gsba.store.finished import map_digest
 from gsba.trajectory.files import write_tum
 from gsba.types import Trajectory
 from gsba.version import __version__
@@ -20,7 +22,7 @@ _UPPER = np.triu_indices(6)
 
 
 def write_localized(
-    folder: Path, run: Path, found: LocalizedPhotos, pictures: Sequence[QueryPicture]
+    folder: Path, map_: RunMap, found: LocalizedPhotos, pictures: Sequence[QueryPicture]
 ) -> None:
     """Write `trajectory.tum`, `poses.csv` and `localized.json`, each whole or not at all.
 
@@ -60,7 +62,8 @@ def write_localized(
     write_csv(folder / "poses.csv", header, table)
     content = {
         "gsba": __version__,
-        "run": str(run.resolve()),
+        "run": str(map_.root.resolve()),
+        "map": map_digest(map_.result, map_.frames),
         "pictures": [
             _as_json(frame, picture) for frame, picture in zip(frames, pictures, strict=True)
         ],

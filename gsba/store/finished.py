@@ -7,6 +7,7 @@ import numpy as np
 from gsba.camera.cameras import Cameras
 from gsba.camera.lens import ONE_CENTRE
 from gsba.log import GsbaError
+from gsba.store.shards import content_digest
 from gsba.store.store import load_stage
 from gsba.types import FrameSet, Reconstruction
 
@@ -25,6 +26,12 @@ def load_run(out: Path, map_number: int = 1) -> tuple[Reconstruction, FrameSet]:
     if not (np.isfinite(shown.timestamps).all() and (np.diff(shown.timestamps) > 0).all()):
         raise GsbaError(f"{out}: its timestamps do not increase: refine again with --fresh")
     return main, shown
+
+
+def map_digest(main: Reconstruction, frames: FrameSet) -> str:
+    """SHA-256 of the names and poses of a map's frames: it differs for other maps, and after the
+    run was refined anew or has grown."""
+    return content_digest(frames.names, main.world_T_rigs)
 
 
 def one_map(

@@ -44,7 +44,12 @@ def located(tmp_path: Path) -> Path:
         "principal": [33.0, 23.5],
         "radial": [0.04, -0.01],
     }
-    content = {"run": str(tmp_path / "run"), "pictures": pictures, "cameras": [camera]}
+    content = {
+        "run": str(tmp_path / "run"),
+        "map": "as it is",
+        "pictures": pictures,
+        "cameras": [camera],
+    }
     (folder / "localized.json").write_text(json.dumps(content))
     return folder
 
@@ -58,7 +63,7 @@ def _entry(path: Path, camera: int | None, world_T_camera: np.ndarray, reason: s
 def test_colmap_has_photos_as_cameras_of_their_own(
     to: ExportFormat, located: Path, tmp_path: Path
 ) -> None:
-    photos = read_photos(located, tmp_path / "run")
+    photos = read_photos(located, tmp_path / "run", "as it is")
     frames, out = panoramas(tmp_path / "frames"), tmp_path / "out"
     given = reconstruction(), frames, out, to
     export(*given, placement=Placement(MOVE), photos=photos, split=False)
@@ -82,7 +87,7 @@ def test_colmap_has_photos_as_cameras_of_their_own(
 def test_photos_are_in_the_order_by_which_readers_hold_images_out(
     num: int, located: Path, tmp_path: Path
 ) -> None:
-    photos, out = read_photos(located, tmp_path / "run"), tmp_path / "out"
+    photos, out = read_photos(located, tmp_path / "run", "as it is"), tmp_path / "out"
     more = (replace(photos.photos[0], name=f"shot{n}") for n in range(num))
     photos = replace(photos, photos=tuple(more))
     frames = panoramas(tmp_path / "frames")
@@ -106,7 +111,7 @@ def test_photos_are_undistorted_for_programs_that_read_pinholes(
     columns, rows = np.meshgrid(np.arange(64) + 0.5, np.arange(48) + 0.5)
     ramp = np.dstack([4 * columns, 5 * rows, np.full_like(rows, 90)]).astype(np.uint8)
     cv2.imwrite(str(tmp_path / "shot0.jpg"), ramp, [cv2.IMWRITE_JPEG_QUALITY, 100])
-    photos, out = read_photos(located, tmp_path / "run"), tmp_path / "out"
+    photos, out = read_photos(located, tmp_path / "run", "as it is"), tmp_path / "out"
     frames, options = panoramas(tmp_path / "frames"), ExportOptions(face_size=16, photos=photos)
     options = replace(options_for("opensplat", options), split=False)
     export_all(reconstruction(), frames, {ExportFormat.COLMAP_FLAT: out}, options)
@@ -124,7 +129,7 @@ def test_photos_are_undistorted_for_programs_that_read_pinholes(
 def test_photos_have_masks_where_all_images_must_have_one(
     to: ExportFormat, located: Path, tmp_path: Path
 ) -> None:
-    photos, out = read_photos(located, tmp_path / "run"), tmp_path / "out"
+    photos, out = read_photos(located, tmp_path / "run", "as it is"), tmp_path / "out"
     frames = panoramas(tmp_path / "frames", masked=True)
     export(reconstruction(), frames, out, to, face_size=16, photos=photos)
     images = {path.stem for path in (out / "images").iterdir()}
@@ -137,7 +142,7 @@ def test_photos_have_masks_where_all_images_must_have_one(
 
 
 def test_photos_that_would_overwrite_one_another_are_refused(located: Path, tmp_path: Path) -> None:
-    photos = read_photos(located, tmp_path / "run")
+    photos = read_photos(located, tmp_path / "run", "as it is")
     twice = replace(photos, photos=(photos.photos[0], replace(photos.photos[1], name="shot0")))
     given = reconstruction(), panoramas(tmp_path / "frames"), tmp_path / "out"
     with pytest.raises(GsbaError, match=r"shot0.jpg and .*shot1.jpg would both be images/photo_sh"):
@@ -146,7 +151,7 @@ def test_photos_that_would_overwrite_one_another_are_refused(located: Path, tmp_
 
 
 def test_nerfstudio_has_intrinsics_of_each_frame(located: Path, tmp_path: Path) -> None:
-    photos = read_photos(located, tmp_path / "run")
+    photos = read_photos(located, tmp_path / "run", "as it is")
     out = exported(tmp_path, ExportFormat.NERFSTUDIO, photos=photos)
     document = json.loads((out / "transforms.json").read_text())
     assert "fl_x" not in document and "k1" not in document
@@ -161,11 +166,15 @@ def test_nerfstudio_has_intrinsics_of_each_frame(located: Path, tmp_path: Path) 
 
 
 def test_lists_that_cannot_be_used_are_refused(located: Path, tmp_path: Path) -> None:
-    refused("are localised in", read_photos, located, tmp_path / "other")
-    refused("is no list of gsba localize", read_photos, tmp_path, tmp_path / "run")
-    photos, frames = read_photos(located, tmp_path / "run"), panoramas(tmp_path / "frames")
+    refused("are localised in", read_photos, located, tmp_path / "other", "as it is")
+    refused("or before it changed", read_photos, located, tmp_path / "run", "grown")
+    refused("is no list of gsba localize", read_photos, tmp_path, tmp_path / "run", "as it is")
+    photos, frames = (
+        read_photos(located, tmp_path / "run", "as it is"),
+        panoramas(tmp_path / "frames"),
+    )
     with pytest.raises(GsbaError, match="photos go beside cube faces"):
         export(reconstruction(), frames, tmp_path / "o", ExportFormat.TUM, photos=photos)
     assert not (tmp_path / "o").exists()
     (tmp_path / "shot0.jpg").unlink()
-    refused("this photo is gone", read_photos, located, tmp_path / "run")
+    refused("this photo is gone", read_photos, located, tmp_path / "run", "as it is")
