@@ -82,6 +82,8 @@ def mask(
     from gsba.frames.scan import scan
     from gsba.masks.carrier import find_carrier, write_carrier
 
+    if out.resolve() == frames.resolve():
+        raise GsbaError(f"--out {out} is the folder of the frames: choose another for masks")
     found_frames = scan(frames, masks=masks, order_suffices=True, calibration=calibration)
     carrier = find_carrier(found_frames)
     written = write_carrier(carrier, found_frames, out)

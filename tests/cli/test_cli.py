@@ -167,12 +167,13 @@ def test_export_checks_its_options(tmp_path: Path) -> None:
         (("export", "run", "--to", "tum", "--baseline", 32), "--baseline is for --scale lens"),
         (("export", "run", "--to", "tum", "--gps-sigma", 1), "give --gps FILE as well"),
         (("export", "run", "--to", "tum", "--gps-offset", 0), "give --gps FILE as well"),
+        (("mask", "run", "--out", "run/"), "is the folder of the frames: choose another"),
         (("evaluate", "run", "--truth", "t", "--against", "b"), "give --splat as well"),
         (("evaluate", "run", "--truth", "t", "--iterations", 9), "give --splat as well"),
         (("evaluate", "run", "--scan", "s", "--depth", "d"), "give --truth FILE as well"),
     ],
 )
-def test_options_without_the_one_they_belong_to_are_refused(
+def test_options_that_do_not_go_together_are_refused(
     arguments: tuple[object, ...], message: str
 ) -> None:
     fails(run_gsba(*arguments), message)
