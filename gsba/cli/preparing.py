@@ -133,6 +133,11 @@ def track(
         panoramas = odometry.without_carrier(panoramas)
     unfinished = out.with_name(f"{out.stem}-unfinished.npz")
     walk = odometry.track_panoramas(panoramas, checkpoint=unfinished)
+    if walk.posed().sum() < 2:
+        raise GsbaError(
+            f"{frames}: odometry finds poses for fewer than two of {len(walk)} frames: gsba refine "
+            "--no-trajectory matches them as stills"
+        )
     write_odometry(
         walk,
         out,

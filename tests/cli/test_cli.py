@@ -36,9 +36,11 @@ def pipeline(monkeypatch: pytest.MonkeyPatch) -> Callable[[BaseException], None]
         def fail(*_: object, **__: object) -> None:
             raise error
 
-        for home, name in (("gsba.pipeline", "refine"), ("gsba.store.finished", "load_run")):
+        finished = ("load_run", "map_digest")
+        for home, names in (("gsba.pipeline", ("refine",)), ("gsba.store.finished", finished)):
             stub = types.ModuleType(home)
-            setattr(stub, name, fail)
+            for name in names:
+                setattr(stub, name, fail)
             monkeypatch.setitem(sys.modules, home, stub)
         monkeypatch.setattr(gsba, "pipeline", sys.modules["gsba.pipeline"], raising=False)
 

@@ -89,6 +89,16 @@ def test_what_is_no_input_is_refused_in_one_line(folder: Path, video: Path, tmp_
     assert not out.exists()
 
 
+def test_frames_without_poses_are_refused(tmp_path: Path) -> None:
+    frames = tmp_path / "noise"
+    frames.mkdir()
+    for n, noise in enumerate(np.random.default_rng(0).integers(0, 256, (4, 128, 256), np.uint8)):
+        cv2.imwrite(str(frames / f"{n}.png"), noise)
+    result = run_gsba("track", frames, "--out", tmp_path / "w.tum", "--masks", "none")
+    assert result.exit_code == 1 and "poses for fewer than two of 4 frames" in result.output
+    assert [path.name for path in tmp_path.iterdir()] == ["noise"]
+
+
 def test_frames_are_extracted_by_what_they_show(video: Path, tmp_path: Path) -> None:
     frames = tmp_path / "frames"
     succeed("extract", video, "--every", "auto", "--out", frames)
