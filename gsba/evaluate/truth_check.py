@@ -5,10 +5,12 @@ import numpy as np
 from gsba.evaluate.trajectory import pose_errors
 from gsba.geometry import extent_of, nearest_rotation, rotation_angle
 from gsba.similarity import NoSimilarityError, extents, is_mirrored, residuals_of, similarity
-from gsba.types import Trajectory
+from gsba.types import Trajectory, rows_across
 
-_MAX_SHIFT = 10  # median steps of the estimate by which clocks may differ
+_MOST_POSES = 200  # of the estimate, on which clocks are tried
+_MIN_OVERLAP = 0.9  # of the estimate with the truth, by another clock
 _MIN_GAIN = 3.0  # by which another clock reduces errors
+_MAX_SHARE = 0.005  # of the truth's extent: largest error with another clock
 _MIN_TURN_DEG = 30.0  # from orientations to positions, between worlds
 _MAX_ERROR_SHARE = 0.1  # of the path's second extent: positions then determine that turn
 
@@ -27,13 +29,15 @@ def fault_of_truth(estimate: Trajectory, truth: Trajectory) -> str:
             "the truth is mirrored: a mirror image of its positions fits at least twice as well; "
             "reverse or swap one of its axes"
         )
-    if shift := _clock_shift(estimate, truth):
+    error = float(np.sqrt(np.mean(errors.positions**2)))
+    large = error > _MAX_SHARE * extent_of(targets)
+    if large and (shift := _clock_shift(estimate, truth)):
         return (
             f"the truth's clock is {abs(shift):.3g} s {'ahead' if shift > 0 else 'behind'}: with "
             f"{-shift:+.3g} s added to its times, positions fit three times as well"
         )
     across = extents(targets)[1] * extent_of(targets)
-    if np.sqrt(np.mean(errors.positions**2)) < _MAX_ERROR_SHARE * across:
+    if error < _MAX_ERROR_SHARE * across:
         between = np.einsum("nij,nkj->ik", true_poses[:, :3, :3], poses[:, :3, :3])
         turn = nearest_rotation(between).T @ errors.fit.rotation
         if (degrees := float(np.degrees(rotation_angle(turn)))) > _MIN_TURN_DEG:
@@ -47,17 +51,22 @@ def fault_of_truth(estimate: Trajectory, truth: Trajectory) -> str:
 
 def _clock_shift(estimate: Trajectory, truth: Trajectory) -> float:
     """Seconds by which the truth's clock is ahead; 0.0 = none fits clearly better than its own."""
-    known = np.isfinite(estimate.world_T_rigs).all(axis=(1, 2))
+    known = np.flatnonzero(np.isfinite(estimate.world_T_rigs).all(axis=(1, 2)))
+    step = float(np.median(np.diff(estimate.timestamps[known])))
+    known = known[rows_across(len(known), _MOST_POSES)]
     times, positions = estimate.timestamps[known], estimate.world_T_rigs[known, :3, 3]
-    step, best, found = float(np.median(np.diff(times))), 1 / _MIN_GAIN, 0.0
-    for shift in step * np.arange(-_MAX_SHIFT, _MAX_SHIFT + 0.5, 0.5):
+    limit, found = _MAX_SHARE * extent_of(truth.world_T_rigs[:, :3, 3]), 0.0
+    first, last = truth.timestamps[[0, -1]]
+    margin = (1 - _MIN_OVERLAP) * (times[-1] - times[0])
+    ends = np.array([first - times[0] - margin, last - times[-1] + margin]) / (step / 2)
+    for shift in np.arange(np.floor(ends[0]), np.ceil(ends[1]) + 1) * step / 2:
         both = np.array([times, times + shift])
-        inside = ((both >= truth.timestamps[0]) & (both <= truth.timestamps[-1])).all(axis=0)
-        if 2 * inside.sum() < len(times) or inside.sum() < 4:
+        inside = ((both >= first) & (both <= last)).all(axis=0)
+        if inside.sum() < max(4, _MIN_OVERLAP * len(times)):
             continue
         own, shifted = (_misfit(positions[inside], truth, some[inside]) for some in both)
-        if shifted < best * own:
-            best, found = shifted / own, float(shift)
+        if shifted < min(limit, own / _MIN_GAIN):
+            limit, found = shifted, float(shift)
     return found
 
 

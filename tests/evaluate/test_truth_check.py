@@ -29,6 +29,17 @@ def test_a_right_truth_has_no_fault(noise: float) -> None:
     assert fault_of_truth(_estimate(noise), TRUTH) == ""
 
 
+def test_a_walk_in_the_middle_of_the_truth_is_found() -> None:
+    walk = Trajectory(T[:20], _estimate().world_T_rigs[15:35])
+    assert "clock is 7.5 s ahead: with -7.5 s added" in fault_of_truth(walk, TRUTH)
+
+
+def test_one_false_pose_is_no_other_clock() -> None:
+    poses = TRUTH.world_T_rigs.copy()
+    poses[9, :3, 3] += 5.0
+    assert fault_of_truth(_estimate(), Trajectory(T, poses)) == ""
+
+
 @pytest.mark.parametrize(
     ("truth", "fault"),
     [
