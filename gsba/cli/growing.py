@@ -40,10 +40,20 @@ def add(
     shared: dict[str, Any] = {"odometry": False if no_trajectory else None, "fps": fps}
     shared |= {"masks": masks or "auto", "calibration": calibration}
     recordings = recordings_of(new or (), recording or (), shared)
+    _refuse_changed([run])
     with connected(cluster) as client:
         given: dict[str, Any] = {"fixed": fixed, "segment": segment, "client": client}
         result = pipeline.add_recordings(run, recordings, out, **given)
     conclude([result], allow_partial)
+
+
+def _refuse_changed(runs: list[Path]) -> None:
+    """Refuse runs whose frames are no longer those that they were made of."""
+    from gsba.inspection.changed_frames import refuse_changed_frames
+    from gsba.store.finished import load_run
+
+    for run in runs:
+        refuse_changed_frames(run, *load_run(run))
 
 
 @command
@@ -63,6 +73,7 @@ def merge(
     with loading():
         from gsba import pipeline
         from gsba.store.cluster import connected
+    _refuse_changed(runs)
     with connected(cluster) as client:
         result = pipeline.merge_runs(runs, out, rigid=rigid, client=client)
     conclude([result], allow_partial)

@@ -57,6 +57,7 @@ def export(
     from gsba.config_file import validated
     from gsba.export.photos import read_photos
     from gsba.export.trainers import format_of, how_to_start, options_for
+    from gsba.inspection.changed_frames import refuse_changed_frames
     from gsba.placement.placement import place
     from gsba.store.cluster import connected, hired
     from gsba.store.finished import load_run, map_digest
@@ -73,6 +74,8 @@ def export(
     dataset = {"face_size": face_size, "images": images, "formats": [to]}
     settings = validated({"placement": world, "export": dataset}).placement
     reconstruction, frames, *_ = load_run(run, map_number)
+    if to.value not in ("ply", "tum", "gltf") or images == "panorama":
+        refuse_changed_frames(run, reconstruction, frames)
     lenses = cameras_of(run, reconstruction, frames, images, map_number)
     folder = out or run / (name if map_number == 1 else f"{name}-map{map_number}")
     known = _baseline(run, baseline) if scale == "lens" else None

@@ -108,6 +108,7 @@ def _compare(
     """Results of splats on the run's poses ("refined") and on others, by name."""
     from gsba.camera.views import Optics
     from gsba.evaluate.splats import compare, poses_for
+    from gsba.inspection.changed_frames import refuse_changed_frames
     from gsba.report.html import add_splats
     from gsba.splat.backend import choose_backend
     from gsba.splat.scores import Lpips
@@ -116,6 +117,7 @@ def _compare(
 
     lpips = Lpips(lpips_weights) if lpips_weights else None
     reconstruction, frames = load_run(run)
+    refuse_changed_frames(run, reconstruction, frames)
     sources = {"refined": reconstruction.world_T_rigs}
     sources |= {name: poses_for(frames, trajectory) for name, trajectory in others.items()}
     renderer = choose_backend(settings.backend)
