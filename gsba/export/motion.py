@@ -48,8 +48,9 @@ def rig_velocities(
     if len(steps) < 2 or steps.max() > 0.25:
         if shutter.exposure_s is not None:
             logger.warning(
-                "the exposure is not written: how the camera moves meanwhile is not known, as the "
-                "run found no readout and frames are more than a quarter of a second apart"
+                "the exposure is not written: how the camera moves meanwhile is known by a "
+                "readout that the run found (in --images lenses and fisheye), or by frames at most "
+                "a quarter of a second apart"
             )
         return None
     from scipy.spatial.transform import Rotation
