@@ -3,8 +3,8 @@
 # give a reflection, it negates the whole matrix, not the direction of the smallest singular value.
 # Of points in a plane, as the places of a walk on level ground are, that is every second time.
 # Expected: the transform that maps the points on one another exactly, at any pose. Seen: half of 400
-# sets of ten coplanar points end metres away (their spread is one metre), without a warning; so do
-# some sets with a millimetre of noise. Points that fill space are right.
+# sets of ten coplanar points end metres away (their spread is one metre), without a warning.
+# Points that fill space are right.
 set -euo pipefail
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT

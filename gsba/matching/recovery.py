@@ -263,13 +263,13 @@ def _match_along(
 ) -> VerifiedPairs:
     """Match pairs (P, 2) guided by the start, and verify that they agree with it."""
 
-    def match(some: np.ndarray, **how: bool) -> VerifiedPairs:
+    def match(some: np.ndarray, search: bool = False) -> VerifiedPairs:
         gates = [PRIOR_GATE] * len(some)
-        found = context.match(some, world_T_rigs, gates, **how)
+        found = context.match(some, world_T_rigs, gates, guided_only=search)
         f0_T_f1s = inverse(world_T_rigs[some[:, 0]]) @ world_T_rigs[some[:, 1]]
         return verified(found, gates, f0_T_f1s, np.zeros(len(some)), context)
 
-    return _scarce_learned(context, chosen, match(chosen, guided_only=True), match)
+    return _scarce_learned(context, chosen, match(chosen, search=True), match)
 
 
 def match_anywhere(context: MatchContext, chosen: np.ndarray, rivals: bool = True) -> VerifiedPairs:
@@ -284,12 +284,12 @@ def match_anywhere(context: MatchContext, chosen: np.ndarray, rivals: bool = Tru
     """
     nowhere = np.tile(np.eye(4), (len(context.keypoints.starts) - 1, 1, 1))
 
-    def match(some: np.ndarray, **how: bool) -> VerifiedPairs:
+    def match(some: np.ndarray, first: bool = False) -> VerifiedPairs:
         gates = [Gate.anywhere()] * len(some)
-        found = context.match(some, nowhere, gates, **how)
+        found = context.match(some, nowhere, gates, strongest=first, guided_only=first)
         return verified(found, gates, None, None, context, rivals)
 
-    found = match(chosen, strongest=True, guided_only=True)
+    found = match(chosen, first=True)
     if context.strongest is not context.frames and context.matcher is guided_search.guided:
         rest = found.missing(chosen)
         return VerifiedPairs.joined([found, match(rest)]) if len(rest) else found
