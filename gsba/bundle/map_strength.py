@@ -8,6 +8,7 @@ that err together: steps predicted by far frames, and distances by both sides of
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -275,6 +276,28 @@ def step_motion(
     correlations = spread[known] / (sigmas[:, :, None] * sigmas[:, None, :])
     inverses = np.linalg.pinv(correlations, hermitian=True)
     return float(np.sqrt(np.einsum("fi,fij,fj->f", scaled, inverses, scaled).mean() / 6))
+
+
+def overlap_ratios(result: Reconstruction, recordings: np.ndarray) -> np.ndarray:
+    """Overlap (F - 1,) of the two frames of each step, over the smaller one of both steps beside
+    it. Overlap: points that both observe, part of all that either does. NaN where a step beside it
+    is missing or of another one of recordings (F,), or where it is twice as long as these."""
+    points = [np.unique(result.observation_points[rows]) for rows in result.observations_by_frame()]
+    overlaps = np.array(
+        [
+            len(np.intersect1d(*two, assume_unique=True)) / max(len(np.union1d(*two)), 1)
+            for two in pairwise(points)
+        ]
+    )
+    lengths = np.linalg.norm(np.diff(result.world_T_rigs[:, :3, 3], axis=0), axis=1)
+    found = np.full(len(overlaps), np.nan)
+    for step in range(1, len(overlaps) - 1):
+        beside = [step - 1, step + 1]
+        near = overlaps[beside].min()
+        one_recording = len(set(recordings[step - 1 : step + 3].tolist())) == 1
+        if one_recording and near > 0 and lengths[step] <= 2 * lengths[beside].max():
+            found[step] = overlaps[step] / near
+    return found
 
 
 _MIN_POINTS = 8  # that both sides see

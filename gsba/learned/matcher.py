@@ -26,7 +26,7 @@ from gsba.types import FACES, Features
 # Pairs of faces that may show the same where the heading is unknown, as cameras are held upright.
 _UPRIGHT_FACES = [*product(range(4), range(4)), (4, 4), (5, 5)]
 _MIN_ALIKE_SHARE = 0.1  # of a face's mutual nearest neighbours: half of the pairs of faces have
-# nine tenths of the true matches (benchmarks/results/tours.md)
+_MAX_PAIRS_OF_FACES = 9  # nine tenths of the true matches (benchmarks/results/tours.md)
 
 
 def make_matcher(settings: RefineSettings, weights: Mapping[str, Path], size: int) -> Matcher:
@@ -55,8 +55,8 @@ class FaceMatcher:
     nothing predicts the pose of neighbours. The network gets only pairs of faces that overlap by
     the predicted pose, and only its matches inside the gate are kept, so that the gate and then
     two-view verification remove matches of repetitive structure. Without a prediction, sides may
-    overlap with sides, up with up and down with down. Of all these, only faces that are alike are
-    compared. Known points with a gate of a fraction of a degree are matched by `guided`.
+    overlap with sides, up with up and down with down. Of all these, only the faces most alike
+    are compared. Known points with a gate of a fraction of a degree are matched by `guided`.
     """
 
     def __init__(self, network: FaceNetwork, size: int) -> None:
@@ -78,11 +78,15 @@ class FaceMatcher:
             for some, found in zip(chosen, (first, second), strict=True)
         )
         rows, scores = [np.zeros((0, 2), np.int64)], [np.zeros(0)]
-        compared = _UPRIGHT_FACES
+        alike = likeness(faces0, faces1, descriptors0, descriptors1)
         if gate.is_prediction or points_f0 is not None:
             compared = overlapping_faces(bearings0, bearings1, f0_T_f1)
-        alike = are_alike(faces0, faces1, descriptors0, descriptors1)
-        for faces in filter(alike.__getitem__, compared):
+        else:
+            by_likeness = sorted(_UPRIGHT_FACES, key=alike.__getitem__, reverse=True)
+            compared = by_likeness[:_MAX_PAIRS_OF_FACES]
+        for faces in compared:
+            if alike[faces] < _MIN_ALIKE_SHARE:
+                continue
             k0, k1 = (
                 some[found.faces[some] == face]
                 for some, found, face in zip(chosen, (first, second), faces, strict=True)
@@ -107,16 +111,16 @@ def _on_face(features: Features, keypoints: np.ndarray) -> FaceKeypoints:
     )
 
 
-def are_alike(
+def likeness(
     faces0: np.ndarray, faces1: np.ndarray, descriptors0: np.ndarray, descriptors1: np.ndarray
 ) -> np.ndarray:
-    """Pairs (6, 6) bool of faces of frames 0 and 1 that hold a tenth of the mutual nearest
-    neighbours of one of them, by the faces (n,) and the descriptors (n, D) of keypoints."""
+    """Likeness (6, 6) of faces of frames 0 and 1: mutual nearest neighbours of both faces, as a
+    share of those of the face with fewer, by the faces (n,) and descriptors (n, D) of keypoints."""
     rows0, rows1 = mutual_nearest(descriptors0, descriptors1)
     counts = np.zeros((len(FACES), len(FACES)))
     np.add.at(counts, (faces0[rows0], faces1[rows1]), 1)
-    most = _MIN_ALIKE_SHARE * np.minimum(counts.sum(axis=1)[:, None], counts.sum(axis=0))
-    return (counts > 0) & (counts >= most)
+    fewer = np.minimum(counts.sum(axis=1)[:, None], counts.sum(axis=0))
+    return counts / np.maximum(fewer, 1)
 
 
 def overlapping_faces(

@@ -30,7 +30,8 @@ def match_neighbours(context: MatchContext, start: Solution) -> VerifiedPairs:
     chosen = pairs.adjacent(len(world_T_rigs))
 
     # The strongest keypoints suffice for a pair's geometry, at a tenth of the cost.
-    found = context.match(chosen, world_T_rigs, [PRIOR_GATE] * len(chosen), strongest=True)
+    search = context.by_search()
+    found = search.match(chosen, world_T_rigs, [PRIOR_GATE] * len(chosen), strongest=True)
     f0_T_f1s = inverse(world_T_rigs[chosen[:, 0]]) @ world_T_rigs[chosen[:, 1]]
     agreeing = partial(
         verification.agree_with_prior,

@@ -1,5 +1,6 @@
 """Neighbours that the trajectory cannot guide: matched without it, to check it against images."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -261,17 +262,21 @@ def _match_along(
     context: MatchContext, world_T_rigs: np.ndarray, chosen: np.ndarray
 ) -> VerifiedPairs:
     """Match pairs (P, 2) guided by the start, and verify that they agree with it."""
-    gates = [PRIOR_GATE] * len(chosen)
-    found = context.match(chosen, world_T_rigs, gates)
-    f0_T_f1s = inverse(world_T_rigs[chosen[:, 0]]) @ world_T_rigs[chosen[:, 1]]
-    return verified(found, gates, f0_T_f1s, np.zeros(len(chosen)), context)
+
+    def match(some: np.ndarray, search: bool = False) -> VerifiedPairs:
+        gates = [PRIOR_GATE] * len(some)
+        found = context.match(some, world_T_rigs, gates, guided_only=search)
+        f0_T_f1s = inverse(world_T_rigs[some[:, 0]]) @ world_T_rigs[some[:, 1]]
+        return verified(found, gates, f0_T_f1s, np.zeros(len(some)), context)
+
+    return _scarce_learned(context, chosen, match(chosen, search=True), match)
 
 
 def match_anywhere(context: MatchContext, chosen: np.ndarray, rivals: bool = True) -> VerifiedPairs:
     """Match whole panoramas without any prediction, and verify their geometry.
 
-    The strongest features are tried first, then all for pairs that these leave open. A learned
-    matcher, whose matches of all features are few and right, gets all at once.
+    The strongest features are searched first, then all for pairs that these leave open; or a
+    learned matcher gets these pairs and those with scarce matches.
 
     Args:
         chosen: (P, 2) frame indices.
@@ -279,17 +284,32 @@ def match_anywhere(context: MatchContext, chosen: np.ndarray, rivals: bool = Tru
     """
     nowhere = np.tile(np.eye(4), (len(context.keypoints.starts) - 1, 1, 1))
 
-    def match(some: np.ndarray, strongest: bool) -> VerifiedPairs:
+    def match(some: np.ndarray, first: bool = False) -> VerifiedPairs:
         gates = [Gate.anywhere()] * len(some)
-        found = context.match(some, nowhere, gates, strongest=strongest)
+        found = context.match(some, nowhere, gates, strongest=first, guided_only=first)
         return verified(found, gates, None, None, context, rivals)
 
-    guided = context.matcher is guided_search.guided
-    first = match(chosen, strongest=guided)
-    if context.strongest is context.frames or not guided:
-        return first
-    rest = first.missing(chosen)
-    return VerifiedPairs.joined([first, match(rest, strongest=False)]) if len(rest) else first
+    found = match(chosen, first=True)
+    if context.strongest is not context.frames and context.matcher is guided_search.guided:
+        rest = found.missing(chosen)
+        return VerifiedPairs.joined([found, match(rest)]) if len(rest) else found
+    return _scarce_learned(context, chosen, found, match)
+
+
+def _scarce_learned(
+    context: MatchContext,
+    chosen: np.ndarray,
+    found: VerifiedPairs,
+    match: Callable[[np.ndarray], VerifiedPairs],
+) -> VerifiedPairs:
+    """Pairs found by search; those of `chosen` (P, 2) that it lacks or has scarce matches of, by
+    `match` with the learned matcher, where the run has one."""
+    if context.matcher is guided_search.guided:
+        return found
+    enough = np.flatnonzero(np.diff(found.matches.offsets) >= SCARCE_MATCHES)
+    found = found.taken(enough.tolist())
+    rest = found.missing(chosen)
+    return VerifiedPairs.joined([found, match(rest)]) if len(rest) else found
 
 
 def match_again(context: MatchContext, found: VerifiedPairs, steps: set[int]) -> VerifiedPairs:

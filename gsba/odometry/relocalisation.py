@@ -26,7 +26,7 @@ def describe(layout: AtlasLayout, atlas: Atlas, usable: np.ndarray | None) -> De
     """SIFT keypoints of an atlas, each in the face that owns it. `usable`: (2 s, 3 s) bool, pixels
     of the scene; None = all."""
     allowed = layout.owned if usable is None else layout.owned & usable
-    sift = cv2.SIFT.create(1500, 3, 0.02)
+    sift = cv2.SIFT.create(1500, 3, 0.02, enable_precise_upscale=True)
     found, descriptors = sift.detectAndCompute(atlas.image, allowed.astype(np.uint8) * 255)
     if descriptors is None:
         return Described(np.zeros((0, 3)), np.zeros((0, 128), np.float32))

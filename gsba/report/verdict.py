@@ -12,6 +12,7 @@ import numpy as np
 
 from gsba.bundle.map_strength import (
     neighbour_shifts,
+    overlap_ratios,
     position_errors,
     scale_changes,
     step_deviations,
@@ -48,6 +49,7 @@ class Figures:
     moved_by_scale: tuple[float, ...]  # (F - 1,) part of the extent by which such a change moves
     # positions of the smaller side
     deviations: tuple[float, ...]  # (F - 1,) of steps from those that far frames predict
+    overlaps: tuple[float, ...]  # (F - 1,) of each step over those beside it, `overlap_ratios`
 
     @property
     def num_steps(self) -> int:
@@ -69,13 +71,14 @@ def measure(report: Mapping[str, Any], main: Reconstruction, shown: FrameSet) ->
     shifts = neighbour_shifts(main) * _ERROR_RATIO * width / (2 * np.pi)
     shifts, checks = shifts[np.isfinite(shifts)], report["trajectory"] or {}
     unknown = (math.nan,) * (len(shown) - 1)
-    changes = moved = deviations = unknown
+    changes = moved = deviations = overlaps = unknown
     if known:
         changes = tuple(scale_changes(main, shown.recording_of_frame).tolist())
         sides = _smaller_sides(main.world_T_rigs[:, :3, 3]) / extent
         # The best similarity takes up half.
         moved = tuple((np.array(changes) * np.maximum(sides, 1e-9) / 2).tolist())
         deviations = tuple(step_deviations(main).tolist())
+        overlaps = tuple(overlap_ratios(main, shown.recording_of_frame).tolist())
     return Figures(
         frames=report["summary"]["frames"] - report["summary"].get("frames_fetched", 0),
         exported=len(shown.chosen()),
@@ -90,6 +93,7 @@ def measure(report: Mapping[str, Any], main: Reconstruction, shown: FrameSet) ->
         scale_changes=changes,
         moved_by_scale=moved,
         deviations=deviations,
+        overlaps=overlaps,
     )
 
 
@@ -145,6 +149,7 @@ MAX_DOUBTED_SHARE = 0.25  # of the steps, by a start that images contradict else
 MAX_UNMATCHED_SHARE = 0.25  # of a run's steps, where frames are missing and no start is given
 MAX_RESIDUAL_RATIO = 3.0  # of a frame, in the median one's: right maps have up to 1.9
 MIN_OBSERVATIONS_SHARE = 0.05  # of a frame, of the median one's: right maps have .09 and more
+MIN_OVERLAP_RATIO = 0.4  # of a step, over those beside it: right maps have .44 and more
 MAX_FALSE_SHARE = 0.1  # of the start's steps; above it the others are in doubt, too
 _MAX_NAMED_FRAMES = 6  # of a reason, in a line of text
 _LOOK_AROUND = "gsba view RUN"
@@ -242,6 +247,7 @@ class _Tests:
         yield from self._loosely_held()
         yield from self._held()
         yield from self._shown_by_two_frames()
+        yield from self._cut()
         yield from self._loosely_scaled()
         yield from self._uncertain()
         yield from self._contradicted()
@@ -398,6 +404,21 @@ class _Tests:
                 "frames closer together there"
             )
             yield Reason(Level.LOOK, self._ends(lone), cause, remedy, command=_LOOK_AROUND)
+
+    def _cut(self) -> Iterator[Reason]:
+        """Steps over which the picture changes as no walk does."""
+        low = np.flatnonzero(np.array(self.figures.overlaps) < MIN_OVERLAP_RATIO)
+        if steps := [step for step in low.tolist() if step not in self.figures.held_steps]:
+            cause = (
+                f"both frames of {len(steps)} of {self.figures.num_steps} steps have far fewer "
+                "points in common than those of the steps beside: if the film is cut there, what "
+                "lies behind may be another place that looks alike"
+            )
+            remedy = (
+                "compare both sides of the place; if the film is cut there, refine its parts as "
+                "recordings of their own"
+            )
+            yield Reason(Level.LOOK, self._ends(steps), cause, remedy, command=_LOOK_AROUND)
 
     def _loosely_scaled(self) -> Iterator[Reason]:
         """Steps over which the scale is not carried on."""

@@ -6,7 +6,7 @@ from plain_records import map_of
 from scipy.spatial.transform import Rotation
 from synthetic import unit, with_noise
 
-from gsba.bundle.map_strength import step_deviations
+from gsba.bundle.map_strength import overlap_ratios, step_deviations
 from gsba.geometry import pose
 from gsba.types import Reconstruction
 
@@ -49,3 +49,29 @@ def test_without_far_frames_nothing_is_predicted() -> None:
 def test_a_camera_that_stands_is_not_contradicted_by_noise() -> None:
     off = step_deviations(_map(nested=False, noise=1e-3, standing=NEST))
     assert np.nanmax(off) < 0.2
+
+
+def _walk(cut: int, step_at_cut: float = 1.0) -> Reconstruction:
+    """Frames along a line that see points of five frames in a row; over the step before frame
+    `cut`, few of them."""
+    lengths = np.ones(NUM)
+    lengths[cut] = step_at_cut
+    poses = pose(np.tile(np.eye(3), (NUM, 1, 1)), np.cumsum(lengths)[:, None] * [1.0, 0, 0])
+    first = np.repeat(np.arange(-4, NUM), 10)[:, None]
+    frames = np.arange(NUM)
+    seen = (frames >= first) & (frames < first + 5)
+    few = (np.arange(len(first)) % 10 == 0)[:, None]
+    seen &= few | ((frames >= cut) == (first + 2 >= cut))
+    owners, frames = np.nonzero(seen)
+    return map_of(poses, np.zeros((len(first), 3)), owners, frames, np.zeros((len(owners), 3)))
+
+
+def test_frames_over_a_cut_have_far_less_in_common_than_those_beside() -> None:
+    one = np.zeros(NUM, np.int64)
+    found = overlap_ratios(_walk(cut=6), one)
+    assert found[5] < 0.4 and np.nanmin(np.delete(found, 5)) > 0.9
+    assert np.isnan(found[[0, -1]]).all()
+    assert np.nanmin(overlap_ratios(_walk(cut=0), one)) > 0.9
+    assert np.isnan(overlap_ratios(_walk(cut=6, step_at_cut=2.5), one)[5])  # a long step
+    two_recordings = (np.arange(NUM) >= 6).astype(int)
+    assert np.isnan(overlap_ratios(_walk(cut=6), two_recordings)[4:7]).all()

@@ -185,8 +185,8 @@ def test_without_a_prediction_sides_that_are_alike_are_compared() -> None:
     asked = _asked((first, second), np.eye(4), Gate.anywhere())[0]
     pairs = [*((there, here) for here, there in SEES.items()), ("up", "up"), ("down", "down")]
     assert sorted(asked) == sorted(pairs)
-    other = replace(second, descriptors=_all_around(1).descriptors)  # chance: all may overlap
-    assert len(_asked((first, other), np.eye(4), Gate.anywhere())[0]) > 12
+    other = replace(second, descriptors=_all_around(1).descriptors)  # chance: any may overlap
+    assert len(_asked((first, other), np.eye(4), Gate.anywhere())[0]) == 9
 
 
 def test_descriptors_of_another_length_are_one_line(

@@ -12,6 +12,7 @@ from tiny_run import BARE, Case, computed_stages
 from gsba.config import FeatureSettings, RefineSettings
 from gsba.evaluate.trajectory import evaluate
 from gsba.features.detection import TRAITS, FaceKeypoints, SiftExtractor
+from gsba.matching import correspondences
 from gsba.photometric import frame_jobs
 from gsba.trajectory.files import read_trajectory
 
@@ -81,6 +82,7 @@ def test_a_run_uses_both_and_resumes(
         return cut(name, greys, hosts, origins, spreads, size, workers)
 
     monkeypatch.setattr(frame_jobs, "cut", cutting)
+    monkeypatch.setattr(correspondences, "SCARCE_MATCHES", 10_000)  # for search, at neighbours
     result = case.refine(out, settings)
     assert Nearest.asked > 50 and sizes == {TRAITS["aliked"].patch_size}
     before = evaluate(read_trajectory(case.slam), case.truth)

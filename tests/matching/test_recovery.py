@@ -238,17 +238,21 @@ def test_a_look_alike_at_a_lost_step_is_not_taken_where_matching_misleads() -> N
         ) == misleading_walk
 
 
-def test_a_learned_matcher_gets_all_keypoints_of_unpredicted_pairs_at_once() -> None:
+def test_a_learned_matcher_gets_all_keypoints_where_search_finds_scarce_matches(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     context, asked = _context(), []
 
     def matcher(frames, *given):
         asked.append(frames)
         return guided_search.guided(frames, *given)
 
-    frames = context.frames
+    frames, pairs = context.frames, np.array([[0, 1], [1, 2]])
     strongest = SearchableFrames(frames.features, 10)
     context = replace(context, strongest=strongest, matcher=matcher)
-    pairs = np.array([[0, 1], [1, 2]])
+    assert len(recovery.match_anywhere(context, pairs).matches.pairs) == 2
+    assert not asked
+    monkeypatch.setattr(recovery, "SCARCE_MATCHES", 10_000)
     assert len(recovery.match_anywhere(context, pairs).matches.pairs) == 2
     assert len(asked) == 2 and all(one is frames for one in asked)
     asked.clear()

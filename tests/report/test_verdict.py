@@ -26,6 +26,7 @@ GOOD = Figures(
     scale_changes=(math.nan, *(0.003,) * (NUM - 3), math.nan),
     moved_by_scale=(math.nan, *(0.0007,) * (NUM - 3), math.nan),
     deviations=(0.01,) * (NUM - 1),
+    overlaps=(math.nan, *(0.9,) * (NUM - 3), math.nan),
 )
 LOOSE = {"scale_changes": (0.0, 0.0, 0.053, 0.03), "moved_by_scale": (0.0, 0.0, 0.012, 0.004)}
 
@@ -177,6 +178,7 @@ def test_lengths_are_metres_where_the_scale_is_known_and_the_camera_is_named() -
         ({"position_error": 0.02}, Level.LOOK, "", "may be off by 2 % of the path's extent"),
         ({"position_error": 0.2}, Level.REFUSED, "", "may be off by 20 % of the path's extent"),
         ({"deviations": (0.3, *(0.0,) * 18)}, Level.LOOK, "000 001", "contradict 1 of 19 steps"),
+        ({"overlaps": (0.9, 0.3, 0.9)}, Level.LOOK, "001 002", "both frames of 1 of 19 steps"),
         ({"deviations": (0.3,) * 19}, Level.REFUSED, None, "contradict 19 of 19 steps"),
         ({"points": 0}, Level.REFUSED, "", "the camera turned on the spot"),
     ],
