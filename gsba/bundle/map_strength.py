@@ -34,6 +34,7 @@ MAX_SCALE_SIGMA = 8e-4  # relative, of two successive baselines' ratio; frames a
 _WEAK_REACH = 2  # frames before and after a weak one that count as weak
 _DRAWS_AT_ONCE = 50  # errors drawn of all poses, in float64
 _MIN_NOISE_RATIO = 0.1  # least estimate, part of the settings' noise
+_MIN_OVERLAP = 0.05  # that is expected of a step, to be judged by
 
 
 @dataclass(frozen=True, slots=True)
@@ -279,9 +280,10 @@ def step_motion(
 
 
 def overlap_ratios(result: Reconstruction, recordings: np.ndarray) -> np.ndarray:
-    """Overlap (F - 1,) of the two frames of each step, over the smaller one of both steps beside
-    it. Overlap: points that both observe, part of all that either does. NaN where a step beside it
-    is missing or of another one of recordings (F,), or where it is twice as long as these."""
+    """Overlap (F - 1,) of the two frames of each step over the expected one. Overlap: points that
+    both observe, part of all that either does. Expected: the smaller one of both steps beside it,
+    to the power of how many times as long the step is. NaN where that is hardly any, or where a
+    step beside it is missing or of another one of recordings (F,)."""
     points = [np.unique(result.observation_points[rows]) for rows in result.observations_by_frame()]
     overlaps = np.array(
         [
@@ -293,10 +295,11 @@ def overlap_ratios(result: Reconstruction, recordings: np.ndarray) -> np.ndarray
     found = np.full(len(overlaps), np.nan)
     for step in range(1, len(overlaps) - 1):
         beside = [step - 1, step + 1]
-        near = overlaps[beside].min()
+        times = max(lengths[step] / max(lengths[beside].max(), 1e-300), 1.0)
+        expected = overlaps[beside].min() ** times
         one_recording = len(set(recordings[step - 1 : step + 3].tolist())) == 1
-        if one_recording and near > 0 and lengths[step] <= 2 * lengths[beside].max():
-            found[step] = overlaps[step] / near
+        if one_recording and expected > _MIN_OVERLAP:
+            found[step] = overlaps[step] / expected
     return found
 
 

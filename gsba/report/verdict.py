@@ -49,7 +49,7 @@ class Figures:
     moved_by_scale: tuple[float, ...]  # (F - 1,) part of the extent by which such a change moves
     # positions of the smaller side
     deviations: tuple[float, ...]  # (F - 1,) of steps from those that far frames predict
-    overlaps: tuple[float, ...]  # (F - 1,) of each step over those beside it, `overlap_ratios`
+    overlaps: tuple[float, ...]  # (F - 1,) of the frames of each step, over the expected one
 
     @property
     def num_steps(self) -> int:
@@ -149,7 +149,7 @@ MAX_DOUBTED_SHARE = 0.25  # of the steps, by a start that images contradict else
 MAX_UNMATCHED_SHARE = 0.25  # of a run's steps, where frames are missing and no start is given
 MAX_RESIDUAL_RATIO = 3.0  # of a frame, in the median one's: right maps have up to 1.9
 MIN_OBSERVATIONS_SHARE = 0.05  # of a frame, of the median one's: right maps have .09 and more
-MIN_OVERLAP_RATIO = 0.4  # of a step, over those beside it: right maps have .44 and more
+MIN_OVERLAP_RATIO = 0.4  # of a step, over the one that those beside it promise: right maps have .44
 MAX_FALSE_SHARE = 0.1  # of the start's steps; above it the others are in doubt, too
 _MAX_NAMED_FRAMES = 6  # of a reason, in a line of text
 _LOOK_AROUND = "gsba view RUN"
@@ -390,11 +390,16 @@ class _Tests:
             return False
         return 0 <= self.figures.moved_by_scale[step] <= MAX_POSITION_ERROR / 2
 
-    def _shown_by_two_frames(self) -> Iterator[Reason]:
+    @property
+    def _lone(self) -> list[int]:
         """Steps of images alone across which no frame beside them matches."""
         rows = {name: row for row, name in enumerate(self.names)}
-        lone = [rows[a] for a, b in self.report.get("lone_steps", ()) if a in rows and b in rows]
-        if lone:
+        lone = self.report.get("lone_steps", ())
+        return [rows[a] for a, b in lone if a in rows and b in rows]
+
+    def _shown_by_two_frames(self) -> Iterator[Reason]:
+        """Steps that their own two frames alone show."""
+        if lone := self._lone:
             cause = (
                 f"{len(lone)} of {self.figures.num_steps} steps are shown by their own two frames "
                 "alone: what lies behind may be another place that looks alike"
@@ -406,19 +411,19 @@ class _Tests:
             yield Reason(Level.LOOK, self._ends(lone), cause, remedy, command=_LOOK_AROUND)
 
     def _cut(self) -> Iterator[Reason]:
-        """Steps over which the picture changes as no walk does."""
-        low = np.flatnonzero(np.array(self.figures.overlaps) < MIN_OVERLAP_RATIO)
-        if steps := [step for step in low.tolist() if step not in self.figures.held_steps]:
+        """Steps over which the picture changes as on no walk."""
+        low = np.flatnonzero(np.array(self.figures.overlaps) < MIN_OVERLAP_RATIO).tolist()
+        if low := [step for step in low if step not in (*self.figures.held_steps, *self._lone)]:
             cause = (
-                f"both frames of {len(steps)} of {self.figures.num_steps} steps have far fewer "
+                f"both frames of {len(low)} of {self.figures.num_steps} steps have far fewer "
                 "points in common than those of the steps beside: if the film is cut there, what "
                 "lies behind may be another place that looks alike"
             )
             remedy = (
                 "compare both sides of the place; if the film is cut there, refine its parts as "
-                "recordings of their own"
+                "recordings of their own (--recording)"
             )
-            yield Reason(Level.LOOK, self._ends(steps), cause, remedy, command=_LOOK_AROUND)
+            yield Reason(Level.LOOK, self._ends(low), cause, remedy, command=_LOOK_AROUND)
 
     def _loosely_scaled(self) -> Iterator[Reason]:
         """Steps over which the scale is not carried on."""
