@@ -10,6 +10,7 @@ import gtsam
 import numpy as np
 
 from factors import BearingTerm, Block, FaceCameras, ReprojectionTerm, Term
+from factors.system_layout import is_hard_constraint
 from gsba.bundle.observation_noise import face_roots
 from gsba.bundle.pose_variables import X
 from gsba.camera.rig import RIG_R_FACE, CubeRig
@@ -201,7 +202,7 @@ class Families:
 
         Raises:
             GsbaError: a factor on a variable that has no value, or a variable that two families
-            have, or whose key is not a family's.
+            have, or whose key is not a family's; a hard constraint, or no graph.
         """
         snapshot = self.snapshot(solved, maps)
         held = any(family.holds_gauge(snapshot) for family in self.members)
@@ -234,8 +235,18 @@ def _terms_of(families: Sequence[Family], snapshot: MapSnapshot) -> FamilyTerms:
                 )
         known = poses | set(own.keys())
         factors, arrays = family.graph(snapshot), tuple(family.blocks(snapshot))
+        if not isinstance(factors, gtsam.NonlinearFactorGraph):
+            raise GsbaError(
+                f"family {family.name}: graph() returns {type(factors).__name__}, not a "
+                "gtsam.NonlinearFactorGraph"
+            )
         for n in range(factors.size()):
             _check_known(family, f"factor {n}", factors.at(n).keys(), known)
+            if is_hard_constraint(factors.at(n)):
+                raise GsbaError(
+                    f"family {family.name}: factor {n} is a hard constraint "
+                    "(noiseModel.Constrained): give it a small sigma instead"
+                )
         for block in arrays:
             _check_known(family, "a block", block.keys, known)
         values.insert(own)

@@ -140,18 +140,31 @@ def optimize(
     result.
 
     Args:
-        graph: native or user factors, on variables of any type.
+        graph: native or user factors, on variables of any type; none is a hard constraint.
         blocks: batched factors on Pose3 variables; their landmarks move along.
         options: tolerances and damping; None = the defaults.
         callback: called with each attempt and the best values so far.
 
     Raises:
-        GsbaError: the cost at the start is not finite.
+        GsbaError: the cost at the start or a Jacobian is not finite, a variable has no value, or a
+            factor is a hard constraint (`gtsam.noiseModel.Constrained`).
     """
     options = options or SolverOptions()
     for block in blocks:
         block.refresh(values)
-    return minimize(reduced_system(graph, blocks, values), values, options, callback)
+    try:
+        system = reduced_system(graph, blocks, values)
+    except ValueError as error:
+        raise GsbaError(f"{error}") from None
+    return minimize(system, values, options, callback)
+
+
+def _linearized(system: System, values: gtsam.Values) -> dict[str, float]:
+    """Cost of each family of a system that is linearized. GsbaError: a Jacobian is not finite."""
+    try:
+        return system.linearize(values)
+    except FloatingPointError as error:
+        raise GsbaError(f"{error}: guard its divisions by zero") from None
 
 
 @threadpool_limits.wrap(limits=1, user_api="blas")  # sums keep their order, fronts are small
@@ -162,13 +175,13 @@ def minimize(
     callback: Callable[[Iteration, gtsam.Values], None] | None = None,
 ) -> OptimizeResult:
     """Minimize the cost of a system by Levenberg-Marquardt: `optimize`, of any system. GsbaError:
-    the cost at the start is not finite."""
+    the cost at the start or a Jacobian is not finite."""
     history = _History(callback)
 
     def result(converged: bool, reason: str) -> OptimizeResult:
         return OptimizeResult(values, tuple(history.steps), converged, reason)
 
-    costs = system.linearize(values)
+    costs = _linearized(system, values)
     bad = [name for name, part in costs.items() if not np.isfinite(part)]
     if bad:
         raise GsbaError(f"the cost of {', '.join(bad)} is not finite at the start: check its input")
@@ -198,7 +211,7 @@ def minimize(
         # a small step says nothing about convergence where damping made it small, and a long chain
         # of frames bends by modes of 1e-6 of the diagonal
         converged = decrease <= negligible and used <= 1e-6
-        costs = system.costs(values) if converged else system.linearize(values)
+        costs = system.costs(values) if converged else _linearized(system, values)
         cost = sum(costs.values())
         history.add(values, cost, costs, used, True)
         if converged:
@@ -229,7 +242,7 @@ def marginal_covariances(
     for block in blocks:
         block.refresh(values)
     system = reduced_system(graph, blocks, values, list(pairwise(keys)))
-    system.linearize(values)
+    _linearized(system, values)
     found = system.covariances(num_draws, np.random.default_rng(seed))
     if found is None:
         nothing = np.full((num_draws, num, 6), np.nan, np.float32)

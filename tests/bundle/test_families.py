@@ -254,6 +254,19 @@ def test_what_cannot_be_solved_is_refused(world: World) -> None:
     with pytest.raises(GsbaError, match="factor 20 is about variable x20, which has no value"):
         Families((Sideways(np.append(measured, 0)),)).terms(start)
 
+    class Hard(Sideways):
+        def graph(self, snapshot: MapSnapshot) -> gtsam.NonlinearFactorGraph:
+            graph, hard = gtsam.NonlinearFactorGraph(), gtsam.noiseModel.Constrained.All(6)
+            graph.add(gtsam.PriorFactorPose3(X(1), gtsam.Pose3(), hard))
+            return graph
+
+    class Forgetful(Sideways):
+        def graph(self, snapshot: MapSnapshot) -> gtsam.NonlinearFactorGraph:
+            super().graph(snapshot)
+
+    refused("family sideways: factor 0 is a hard", Families((Hard(measured),)).terms, start)
+    refused(r"graph\(\) returns NoneType", Families((Forgetful(measured),)).terms, start)
+
 
 def test_values_so_far_are_shown_to_families(world: World) -> None:
     seen = list[float]()

@@ -353,6 +353,41 @@ def test_bad_steps_are_refused_and_bad_starts_reported(world):
     refused("graph is not finite", optimize, graph, values, [world.block()])
 
 
+def _pulled(jacobian):
+    """A factor on x0 with this Jacobian."""
+
+    def error(_factor, _values, jacobians):
+        if jacobians is not None:
+            jacobians[0] = jacobian
+        return np.ones(1)
+
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(1), [X(0)], error)
+
+
+def test_a_jacobian_that_is_not_finite_is_named(world):
+    for bad in (np.nan, np.inf):
+        graph, row = gtsam.NonlinearFactorGraph(world.graph), np.eye(6)[:1]
+        row[0, 3] = bad
+        graph.add(_pulled(row))
+        refused("the Jacobian of the factor on x0 is not finite", optimize, graph, world.values)
+
+
+def test_hard_constraints_are_refused(world):
+    hard = gtsam.noiseModel.Constrained.All(6)
+    for factor in (
+        gtsam.PriorFactorPose3(X(3), world.truth[3], hard),
+        gtsam.NonlinearEqualityPose3(X(3), world.truth[3]),
+    ):
+        graph = gtsam.NonlinearFactorGraph(world.graph)
+        graph.add(factor)
+        refused("the factor on x3 is a hard constraint", optimize, graph, world.values)
+
+
+def test_nothing_is_solved_at_once(world):
+    result = optimize(gtsam.NonlinearFactorGraph(), world.values)
+    assert result.converged and result.cost == 0 and result.values.equals(world.values, 0.0)
+
+
 def test_interrupt_passes_through(world):
     def stop(_iteration, _values):
         raise KeyboardInterrupt
@@ -373,8 +408,7 @@ def test_bad_terms_are_named(world):
         )
     with pytest.raises(ValueError, match="positive"):
         LandmarkBlock(world.keys, np.zeros((1, 3)), [BearingTerm(one, one, np.eye(3)[:1], 0.0)])
-    with pytest.raises(ValueError, match="no value"):
-        optimize(world.graph, gtsam.Values())
+    refused("no value", optimize, world.graph, gtsam.Values())
 
 
 def test_landmarks_are_eliminated_in_runs_of_any_length(world, monkeypatch):
