@@ -81,7 +81,7 @@ class LandmarkResidual:
             measurement: (3,) as the function takes it.
             noise_model: of dimension 2.
         """
-        measured = np.asarray(measurement, dtype=np.float64)[None]
+        measured = np.array(measurement, dtype=np.float64)[None]
 
         def residual(
             world_T_rig: np.ndarray, point: np.ndarray

@@ -411,6 +411,48 @@ def test_bad_terms_are_named(world):
     refused("no value", optimize, world.graph, gtsam.Values())
 
 
+def test_what_would_be_taken_for_something_else_is_refused(world):
+    """Inputs of a plausible type and shape that would give another problem without a word."""
+    one, ray, points = np.array([0]), np.eye(3)[:1], np.ones((2, 3))
+
+    def block(frames=one, rays=ray, keys=world.keys, points_world=points):
+        LandmarkBlock(keys, points_world, [BearingTerm(frames, one, rays, SIGMA_RAD)])
+
+    block()
+    for message, given in {
+        "of length one": {"rays": 2 * ray},
+        "integers": {"frames": np.array([0.5])},
+        "once": {"keys": [X(0), X(0)]},
+        r"\(J, 3\), not \(3, 2\)": {"points_world": points.T},
+    }.items():
+        with pytest.raises(ValueError, match=message):
+            block(**given)
+    noise = gtsam.noiseModel.Unit.Create(2)
+    for bad in (2 * ray[0], np.full(3, np.nan), ray):
+        with pytest.raises(ValueError, match="of length one"):
+            BearingFactor(X(0), L(0), bad, noise)
+    for face in (-1, 4):
+        with pytest.raises(ValueError, match="out of range"):
+            ReprojectionFactor(X(0), L(0), np.zeros(2), face, CAMERAS, noise)
+    for focals in (np.zeros(4), np.full(4, np.nan), np.ones(3)):
+        with pytest.raises(ValueError, match="focal lengths"):
+            FaceCameras(CAMERAS.rig_R_faces, focals, CAMERAS.principals)
+
+
+def test_factors_keep_their_measurement(world):
+    """The caller's array may be filled anew for the next factor."""
+    values, noise = gtsam.Values(world.values), gtsam.noiseModel.Unit.Create(2)
+    values.insert(L(0), world.truth[0].transformFrom(np.array([0.2, 0.1, 3.0])))
+    ray, pixel = np.array([0.0, 0.0, 1.0]), np.array([250.0, 260.0])
+    factors = [
+        BearingFactor(X(0), L(0), ray, noise),
+        ReprojectionFactor(X(0), L(0), pixel, 0, CAMERAS, noise),
+    ]
+    before = [factor.error(values) for factor in factors]
+    ray[:], pixel[:] = [0.0, 1.0, 0.0], 0.0
+    assert [factor.error(values) for factor in factors] == before
+
+
 def test_landmarks_are_eliminated_in_runs_of_any_length(world, monkeypatch):
     whole = world.block().linearize(world.values)
     monkeypatch.setattr(landmarks, "_MAX_VISITS_AT_ONCE", 7)
