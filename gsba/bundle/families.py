@@ -141,15 +141,39 @@ class FamilyTerms:
         return kept(values, keys) if keys else None
 
 
+def _check_complete(family: Family) -> None:
+    """GsbaError where a family lacks a name or digest, or gives residuals that nothing asks for."""
+    kind = type(family)
+    for attribute in ("name", "digest"):
+        if not hasattr(family, attribute):
+            raise GsbaError(f"family {kind.__name__} has no {attribute}: give it one, a text")
+    gives = {
+        method
+        for method in ("graph", "blocks", "landmark_terms", "fitted")
+        if getattr(kind, method) is not getattr(Family, method)
+    }
+    if not gives:
+        raise GsbaError(
+            f"family {family.name} has no residuals: define graph, blocks or landmark_terms"
+        )
+    if "landmark_terms" in gives and not family.observes_points:
+        raise GsbaError(
+            f"family {family.name}: its landmark_terms count only with observes_points = True"
+        )
+
+
 @dataclass(frozen=True, slots=True)
 class Families:
-    """The families of a run, and the frames of their snapshots."""
+    """The families of a run, and the frames of their snapshots. GsbaError: two have one name, or
+    one has no name, no digest or no residuals."""
 
     members: tuple[Family, ...] = ()
     names: tuple[str, ...] = ()  # (F) of the frames
     timestamps: np.ndarray = field(default_factory=lambda: np.zeros(0))  # (F,) float64 seconds
 
     def __post_init__(self) -> None:
+        for family in self.members:
+            _check_complete(family)
         names = [family.name for family in self.members]
         for name in {name for name in names if names.count(name) > 1}:
             raise GsbaError(f"two families are named {name}: give each a name of its own")
