@@ -144,6 +144,8 @@ class FamilyTerms:
 def _check_complete(family: Family) -> None:
     """GsbaError where a family lacks a name or digest, or gives residuals that nothing asks for."""
     kind = type(family)
+    if Family not in kind.__mro__:
+        raise GsbaError(f"families: {family!r} is no object of a subclass of gsba.Family")
     for attribute in ("name", "digest"):
         if not hasattr(family, attribute):
             raise GsbaError(f"family {kind.__name__} has no {attribute}: give it one, a text")

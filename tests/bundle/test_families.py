@@ -287,6 +287,7 @@ class _Unasked(Family):
 
 
 def test_a_family_that_could_not_take_part_is_refused() -> None:
+    refused("_Misspelt'> is no object of a subclass of gsba.Family", Families, (_Misspelt,))
     refused("family _Nameless has no name", Families, (_Nameless(),))
     refused("family misspelt has no residuals: define graph", Families, (_Misspelt(),))
     refused("family unasked: .* observes_points = True", Families, (_Unasked(),))
