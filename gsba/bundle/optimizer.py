@@ -18,6 +18,8 @@ from gsba.types import Iteration, JointErrors
 
 logger = logging.getLogger(__name__)
 
+_COST_PRECISION = 1e-9  # part of a cost below which its change may be rounding
+
 
 @dataclass(frozen=True, slots=True)
 class SolverOptions:
@@ -187,6 +189,7 @@ def minimize(
         raise GsbaError(f"the cost of {', '.join(bad)} is not finite at the start: check its input")
     cost = sum(costs.values())
     damping = _Damping(options.lambda_initial)
+    promised = 0.0  # largest decrease predicted for a step rejected since the last accepted one
     history.add(values, cost, costs, damping.value, True)
     for _ in range(options.max_iterations):
         negligible = options.relative_tolerance * cost
@@ -198,15 +201,18 @@ def minimize(
         if steps is not None:
             trial = system.retract(values, steps)
             trial_cost, predicted = system.propose(trial, steps), system.predicted_decrease()
+            promised = max(promised, predicted)
         if not trial_cost <= cost:  # also where it is not a number
             history.add(values, trial_cost, {}, used, False)
             if predicted <= negligible:
+                if promised > max(negligible, _COST_PRECISION * cost):
+                    return result(False, "no step decreases the cost as the Jacobians predict")
                 return result(True, "no step decreases the cost")
             if not damping.raised():
                 return result(False, "no damping gives a good step")
             continue
         system.accept(trial)
-        values, decrease = trial, cost - trial_cost
+        values, decrease, promised = trial, cost - trial_cost, 0.0
         damping.lower(decrease / predicted if predicted > 0 else 1.0)
         # a small step says nothing about convergence where damping made it small, and a long chain
         # of frames bends by modes of 1e-6 of the diagonal

@@ -372,6 +372,25 @@ def test_a_jacobian_that_is_not_finite_is_named(world):
         refused("the Jacobian of the factor on x0 is not finite", optimize, graph, world.values)
 
 
+def test_a_jacobian_of_the_wrong_sign_does_not_converge(world):
+    def height(sign):
+        def error(_factor, values, jacobians):
+            pose = values.atPose3(X(0))
+            if jacobians is not None:
+                row = np.append(np.zeros(3), pose.rotation().matrix()[1])
+                jacobians[0] = sign * row[None]
+            return np.array([pose.y() - 1.0])
+
+        graph = gtsam.NonlinearFactorGraph(world.graph)
+        noise = gtsam.noiseModel.Isotropic.Sigma(1, 1e-3)
+        graph.add(gtsam.CustomFactor(noise, [X(0)], error))
+        return graph
+
+    assert optimize(height(1.0), world.values).converged
+    result = optimize(height(-1.0), world.values)
+    assert not result.converged and "as the Jacobians predict" in result.reason
+
+
 def test_hard_constraints_are_refused(world):
     hard = gtsam.noiseModel.Constrained.All(6)
     for factor in (
