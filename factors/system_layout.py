@@ -44,7 +44,7 @@ class SystemLayout:
                 keys = ", ".join(map(gtsam.DefaultKeyFormatter, graph.at(i).keys()))
                 raise ValueError(
                     f"the factor on {keys} is a hard constraint (noiseModel.Constrained): give it "
-                    "a small sigma instead"
+                    "a small sigma such as 1e-6"
                 )
         factor_keys = [graph.at(i).keys() for i in range(graph.size()) if graph.exists(i)]
         self.graph_keys = sorted({key for keys in factor_keys for key in keys})

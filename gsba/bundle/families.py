@@ -271,7 +271,7 @@ def _terms_of(families: Sequence[Family], snapshot: MapSnapshot) -> FamilyTerms:
             if is_hard_constraint(factors.at(n)):
                 raise GsbaError(
                     f"family {family.name}: factor {n} is a hard constraint "
-                    "(noiseModel.Constrained): give it a small sigma instead"
+                    "(noiseModel.Constrained): give it a small sigma such as 1e-6"
                 )
         for block in arrays:
             _check_known(family, "a block", block.keys, known)
