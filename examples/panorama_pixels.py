@@ -24,7 +24,7 @@ def longitude_and_latitude(measured, vector, residual, jacobian):
     """Radians by which a point is right of and below the bearing (3,) it was measured at.
 
     Args:
-        vector: (3,) from the camera to the point, rig frame: x right, y down, z forward.
+        vector: (3,) from the lens to the point, rig frame: x right, y down, z forward.
         residual (2,), jacobian (2, 3): written.
     """
     x, y, z = vector
@@ -51,6 +51,7 @@ class PanoramaPixels(Family):
 
     def landmark_terms(self, observed: PointObservations) -> Sequence[Term]:
         seen = np.hypot(observed.bearings_rig[:, 0], observed.bearings_rig[:, 2]) > _LEAST_SINE
+        origins = observed.origins_rig  # of two lenses, each ray starts at its own
         return [
             LandmarkTerm(
                 observed.frames[seen],
@@ -59,6 +60,7 @@ class PanoramaPixels(Family):
                 longitude_and_latitude,
                 observed.sigmas_rad[seen],
                 name=self.name,
+                origins_rig=None if origins is None else origins[seen],
             )
         ]
 

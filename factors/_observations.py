@@ -43,6 +43,9 @@ BEARING, REPROJECTION, GIVEN = 0, 1, 2  # kinds of measurement; from GIVEN on on
 # that others wrote
 MIN_DEPTH = 1e-9  # z of a unit direction below which a point counts as behind the face
 
+UNIT_TOLERANCE = 1e-6  # largest deviation of a bearing's length from one: residuals are angles only
+# for unit bearings
+
 
 class Observations(NamedTuple):
     """All observations of a block, sorted by landmark, then frame."""
@@ -216,7 +219,7 @@ def covisible_pairs(
 
 def check_term(term: Term, num_frames: int, num_points: int) -> None:
     """Refuse a term that is inconsistent with its block. ValueError: arrays have unequal lengths,
-    indices are out of range, or values not finite."""
+    indices are no integers or out of range, values not finite, or bearings not of length one."""
     frames, points = np.asarray(term.frames), np.asarray(term.points)
     rows = term.measurements()
     if not len(frames) == len(points) == len(rows):
@@ -226,14 +229,20 @@ def check_term(term: Term, num_frames: int, num_points: int) -> None:
         )
     if len(frames) == 0:
         return
+    if not (frames.dtype.kind in "iu" and points.dtype.kind in "iu"):
+        raise ValueError(f"term {term.name!r}: indices of frames and points must be integers")
     if frames.min() < 0 or frames.max() >= num_frames:
         raise ValueError(f"term {term.name!r}: frame index out of range 0..{num_frames - 1}")
     if points.min() < 0 or points.max() >= num_points:
         raise ValueError(f"term {term.name!r}: point index out of range 0..{num_points - 1}")
     if not np.all(np.isfinite(rows)):
         raise ValueError(f"term {term.name!r}: measurements must be finite")
+    if term.kind == BEARING and np.abs(np.linalg.norm(rows, axis=1) - 1).max() > UNIT_TOLERANCE:
+        raise ValueError(f"term {term.name!r}: bearings must be of length one")
     origins = term.origins_rig
-    if origins is not None and not (origins.shape == (len(rows), 3) and np.isfinite(origins).all()):
+    if origins is not None and not (
+        np.shape(origins) == (len(rows), 3) and np.isfinite(origins).all()
+    ):
         raise ValueError(f"term {term.name!r}: origins must be finite, ({len(rows)}, 3)")
     num_cameras = len(term.cameras())
     if num_cameras and not (rows[:, 2].min() >= 0 and rows[:, 2].max() < num_cameras):

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from factors._observations import BEARING
+from factors._observations import BEARING, UNIT_TOLERANCE
 from factors._terms import custom_factor, rig_vectors, whitener_rows
 
 _MIN_SINE = 1e-12  # sine of the angle below which the residual's direction is undefined near pi
@@ -100,6 +100,14 @@ class BearingTerm:
         return np.zeros((0, 12))
 
 
+def _one_bearing(bearing_rig: np.ndarray) -> np.ndarray:
+    """A copy (1, 3) of a bearing. ValueError: it is not (3,), or not of length one."""
+    bearing = np.array(bearing_rig, dtype=np.float64)
+    if bearing.shape != (3,) or not abs(np.linalg.norm(bearing) - 1) <= UNIT_TOLERANCE:
+        raise ValueError(f"a bearing must be (3,) and of length one, not {bearing}")
+    return bearing[None]
+
+
 def BearingFactor(
     pose_key: int, point_key: int, bearing_rig: np.ndarray, noise_model: gtsam.noiseModel.Base
 ) -> gtsam.CustomFactor:
@@ -109,8 +117,10 @@ def BearingFactor(
         pose_key, point_key: keys of a Pose3 `world_T_rig` and of a Point3.
         bearing_rig: (3,) unit, rig frame.
         noise_model: of dimension 2, radians on `tangent_basis(bearing_rig)`, robust or not.
+
+    ValueError: the bearing is not of length one.
     """
-    measured = np.asarray(bearing_rig, dtype=np.float64)[None]
+    measured = _one_bearing(bearing_rig)
 
     def residual(world_T_rig: np.ndarray, point: np.ndarray):
         return bearing_residuals(world_T_rig, point, measured)
@@ -134,8 +144,10 @@ def LensBearingFactor(
         bearing_rig: (3,) unit, rig frame.
         noise_model: of dimension 2, radians on `tangent_basis(bearing_rig)`, robust or not.
         sign: 1 for the front lens, -1 for the opposite one.
+
+    ValueError: the bearing is not of length one.
     """
-    measured = np.asarray(bearing_rig, dtype=np.float64)[None]
+    measured = _one_bearing(bearing_rig)
 
     def error(_factor, values: gtsam.Values, jacobians) -> np.ndarray:
         world_T_rig = values.atPose3(pose_key).matrix()[None]

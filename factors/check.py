@@ -18,7 +18,7 @@ def jacobian_errors(
 
     Returns:
         For each key the largest entry of |analytic - numerical|, relative to the largest entry of
-        that Jacobian (to 1 where all entries are smaller).
+        that Jacobian (to 1 where all entries are smaller); inf where one is not finite.
     """
     linear = factor.linearize(values)
     jacobian = linear.jacobian()[0]
@@ -37,6 +37,7 @@ def jacobian_errors(
                 moved.append(-factor.linearize(values.retract(delta)).jacobian()[1])
             numerical[:, i] = (moved[0] - moved[1]) / (2 * step)
         scale = max(1.0, float(np.abs(analytic).max(initial=0.0)))
-        errors[key] = float(np.abs(analytic - numerical).max(initial=0.0)) / scale
+        error = float(np.abs(analytic - numerical).max(initial=0.0)) / scale
+        errors[key] = error if np.isfinite(error) else np.inf  # max() of a dictionary skips NaN
         column += dims[key]
     return errors

@@ -87,7 +87,7 @@ def reduced_system(
 ) -> ReducedSystem:
     """The normal equations of a graph and blocks, with the cheaper solver: conjugate gradients take
     over where covisibility would fill in a factorization. `covariances` returns the joint blocks of
-    `pairs` of keys. ValueError: a variable has no value."""
+    `pairs` of keys. ValueError: a variable has no value, or a factor is a hard constraint."""
     layout = SystemLayout(graph, blocks, values, pairs)
     offered = {i: block.products() for i, block in enumerate(layout.blocks)}
     products = {i: product for i, product in offered.items() if product is not None}

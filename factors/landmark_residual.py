@@ -30,20 +30,26 @@ class LandmarkResidual:
         landmark in the rig frame (3,), which writes the residual (2,), not whitened, and its
         Jacobian by that vector (2, 3), all float64.
 
-        It returns False where the landmark cannot be observed, behind a face for instance: the
-        residual is a large constant there, the Jacobian zero. It must be what Numba compiles, and
-        is not called for a warning: division by zero gives inf or nan.
+        Both are zero when it is called. It returns True where the landmark can be observed. Where
+        it cannot, behind a face for instance, it returns False and should write a large constant
+        residual, so that no step gains by leading there; the Jacobian counts as zero. It must be
+        what Numba compiles, and is not called for a warning: division by zero gives inf or nan.
+        TypeError: it does not return True or False on every path.
         """
         compiled = njit(error_model="numpy")(function)
 
         @cfunc(types.void(_FLOATS, _FLOATS, _FLOATS), error_model="numpy")
         def entry(measurement, vector, out):  # type: ignore[no-untyped-def]
             written = carray(out, (_NUM_OUT,))
+            written[:] = 0.0  # the memory holds the observation before
             residual, jacobian = written[:2], written[2:8].reshape((2, 3))
             valid = compiled(carray(measurement, (3,)), carray(vector, (3,)), residual, jacobian)
             written[8] = 1.0 if valid else 0.0
 
         self.name: str = function.__name__
+        returned = types.unliteral(compiled.nopython_signatures[0].return_type)  # type: ignore
+        if not isinstance(returned, types.Boolean):
+            raise TypeError(f"{self.name} must return True or False on every path, not {returned}")
         self.address = int(entry.address or 0)
         self._compiled, self._entry = compiled, entry  # their code lives as long as they do
 
@@ -75,7 +81,7 @@ class LandmarkResidual:
             measurement: (3,) as the function takes it.
             noise_model: of dimension 2.
         """
-        measured = np.asarray(measurement, dtype=np.float64)[None]
+        measured = np.array(measurement, dtype=np.float64)[None]
 
         def residual(
             world_T_rig: np.ndarray, point: np.ndarray

@@ -63,8 +63,8 @@ class LandmarkBlock(Block):
             polish_steps: Gauss-Newton steps on the landmarks after each proposed pose step.
 
         Raises:
-            ValueError: indices are out of range, values not finite, or arrays of unequal
-            length.
+            ValueError: a key occurs twice, points are not (J, 3), indices are no integers or out of
+            range, values not finite, bearings not of length one, or arrays of unequal length.
         """
         self.keys = [int(key) for key in keys]
         self.loss = loss or RobustLoss()
@@ -72,7 +72,12 @@ class LandmarkBlock(Block):
         self.polish_steps = polish_steps
         self.terms = tuple(terms)
         self.families = tuple(dict.fromkeys(term.name for term in terms))
-        points = np.array(points_world, dtype=np.float64).reshape(-1, 3)
+        if len(set(self.keys)) < len(self.keys):
+            raise ValueError("a block must name each of its keys once")
+        points = np.array(points_world, dtype=np.float64)
+        if points.size and points.shape != (len(points), 3):
+            raise ValueError(f"points_world must be (J, 3), not {points.shape}")
+        points = points.reshape(-1, 3)
         for term in terms:
             check_term(term, len(self.keys), len(points))
         if not np.all(np.isfinite(points)):

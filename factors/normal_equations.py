@@ -43,7 +43,10 @@ class NormalEquations:
         return self._layout.first_block
 
     def linearize(self, values: gtsam.Values) -> dict[str, float]:
-        """Assemble H and the gradient at `values`; returns the cost of each family."""
+        """Assemble H and the gradient at `values`; returns the cost of each family.
+
+        FloatingPointError: a Jacobian of the graph is not finite where its residual is.
+        """
         layout = self._layout
         self._diagonal = np.zeros((layout.num, DIM, DIM))
         self._gradient = np.zeros((layout.num, DIM))
@@ -85,7 +88,9 @@ class NormalEquations:
     def _add_graph(self, values: gtsam.Values) -> None:
         """Add the native and user factors, linearized by GTSAM."""
         layout, num = self._layout, len(self._layout.column_blocks)
-        rows, columns, entries = self._layout.graph.linearize(values).sparseJacobian_()
+        linear = layout.graph.linearize(values)
+        _check_finite(linear)
+        rows, columns, entries = linear.sparseJacobian_()
         augmented = csr_matrix(
             (entries, (rows.astype(np.int64) - 1, columns.astype(np.int64) - 1)),
             shape=(int(rows.max(initial=1)), num + 1),
@@ -107,6 +112,18 @@ class NormalEquations:
         np.add.at(self._diagonal, (block_i[same], offset_i[same], offset_j[same]), x[same])
         slots = np.searchsorted(self._codes, block_i[upper] * layout.num + block_j[upper])
         np.add.at(self._off_diagonal, (slots, offset_i[upper], offset_j[upper]), x[upper])
+
+
+def _check_finite(linear: gtsam.GaussianFactorGraph) -> None:
+    """FloatingPointError where a Jacobian is not finite: GTSAM's sparse Jacobian has no NaN, but
+    zeros in their place. Residuals that are not finite are left to the cost."""
+    if np.isfinite(linear.gradientAtZero().norm()):
+        return
+    for factor in (linear.at(i) for i in range(linear.size())):
+        jacobian, right = factor.jacobian() if factor else (np.zeros(0), np.zeros(0))
+        if np.isfinite(right).all() and not np.isfinite(jacobian).all():
+            keys = ", ".join(map(gtsam.DefaultKeyFormatter, factor.keys()))
+            raise FloatingPointError(f"the Jacobian of the factor on {keys} is not finite")
 
 
 def damping_of(diagonal: np.ndarray, damping: float) -> np.ndarray:

@@ -14,7 +14,9 @@ _kernel, _ = kernel_and_part()
 def block_factor(block: Block) -> gtsam.CustomFactor:
     """A factor on a block's Pose3 variables, for any GTSAM optimizer: its error is the robust cost,
     inner variables optimised for the poses, and its linearization that cost's model, dense over all
-    poses. If derivatives are requested, these inner variables become the block's current ones."""
+    poses. If derivatives are requested, these inner variables become the block's current ones.
+
+    GTSAM does not call `block.refresh`: call it at the start values, for a block that has one."""
     num, pairs = len(block.keys), np.asarray(block.pairs).reshape(-1, 2)
 
     def error(_factor, values: gtsam.Values, jacobians) -> np.ndarray:

@@ -11,11 +11,24 @@ from factors._terms import custom_factor, rig_vectors, whitener_rows
 
 @dataclass(frozen=True, slots=True)
 class FaceCameras:
-    """The pinhole faces of a rig; all share its centre."""
+    """The pinhole faces of a rig; all share its centre. ValueError: arrays of unequal lengths, not
+    finite, or focal lengths that are not positive."""
 
     rig_R_faces: np.ndarray  # (C, 3, 3) float64, face axes x right, y down, z forward
     focals: np.ndarray  # (C,) float64, pixels
     principals: np.ndarray  # (C, 2) float64, (u, v) pixels, corner origin
+
+    def __post_init__(self) -> None:
+        num = len(self.rig_R_faces)
+        shapes = (num, 3, 3), (num,), (num, 2)
+        arrays = self.rig_R_faces, self.focals, self.principals
+        if tuple(map(np.shape, arrays)) != shapes:
+            raise ValueError(
+                f"rotations, focal lengths and principal points of {num} faces must be {shapes}, "
+                f"not {tuple(map(np.shape, arrays))}"
+            )
+        if not (all(np.isfinite(a).all() for a in arrays) and np.all(np.greater(self.focals, 0))):
+            raise ValueError("face cameras must be finite, and their focal lengths positive")
 
     def rows(self) -> np.ndarray:
         """(C, 12) rows as the kernels read them."""
@@ -106,9 +119,14 @@ def ReprojectionFactor(
     Args:
         pose_key, point_key: keys of a Pose3 `world_T_rig` and of a Point3.
         pixel: (2,) measured (u, v) on the face, corner origin.
+        face: row of `cameras`.
         noise_model: of dimension 2, pixels, robust or not.
+
+    ValueError: there is no such face.
     """
-    measured = np.asarray(pixel, dtype=np.float64)[None]
+    measured = np.array(pixel, dtype=np.float64)[None]
+    if not 0 <= face < len(cameras.focals):
+        raise ValueError(f"face {face} is out of range 0..{len(cameras.focals) - 1}")
 
     def residual(world_T_rig: np.ndarray, point: np.ndarray):
         return reprojection_residuals(world_T_rig, point, measured, np.array([face]), cameras)[:3]

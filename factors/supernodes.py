@@ -167,7 +167,7 @@ def _relaxed(
 ) -> tuple[np.ndarray, tuple[np.ndarray, ...], np.ndarray]:
     """Starts, rows and parents of runs, small ones absorbed by the next (not over `cut`)."""
     kept: list[tuple[int, int, np.ndarray, int]] = []  # first, end, rows, zeros
-    for first, end, below in zip(firsts, [*firsts[1:], num], rows, strict=True):
+    for first, end, below in zip(firsts, [*firsts, num][1:], rows, strict=True):
         zeros = 0
         while kept and first != cut:
             start, stop, under, hidden = kept[-1]

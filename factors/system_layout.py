@@ -37,8 +37,15 @@ class SystemLayout:
         order: Sequence[int] = (),
     ) -> None:
         """Place the variables, those of `order` first; `covariances` returns the joint blocks of
-        pairs of keys. ValueError: a variable has no value."""
+        pairs of keys. ValueError: a variable has no value, or a factor is a hard constraint."""
         self.graph, self.blocks = graph, tuple(blocks)
+        for i in range(graph.size()):
+            if graph.exists(i) and is_hard_constraint(graph.at(i)):
+                keys = ", ".join(map(gtsam.DefaultKeyFormatter, graph.at(i).keys()))
+                raise ValueError(
+                    f"the factor on {keys} is a hard constraint (noiseModel.Constrained): give it "
+                    "a small sigma such as 1e-6"
+                )
         factor_keys = [graph.at(i).keys() for i in range(graph.size()) if graph.exists(i)]
         self.graph_keys = sorted({key for keys in factor_keys for key in keys})
         block_keys = [key for block in self.blocks for key in block.keys]
@@ -86,3 +93,9 @@ class SystemLayout:
             )
         }
         self.factor_pairs = np.array(sorted(shared), dtype=np.int64).reshape(-1, 2)
+
+
+def is_hard_constraint(factor: gtsam.NonlinearFactor) -> bool:
+    """True if a residual of a factor has no noise: normal equations have no weight for it."""
+    noise = factor.noiseModel() if isinstance(factor, gtsam.NoiseModelFactor) else None
+    return noise is not None and noise.isConstrained()

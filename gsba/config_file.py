@@ -18,16 +18,19 @@ PRESETS = Path(__file__).parent / "presets"  # folder of settings that come with
 _NONE = "none"
 
 
-def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> RefineSettings:
+def load_config(path: Path | str | None = None, overrides: Sequence[str] = ()) -> RefineSettings:
     """Settings of a run: defaults, then the file, then the overrides.
 
     Args:
         path: TOML file with a table per stage, holding overrides only; or the name of a preset.
         overrides: `stage.key=value` each, the value written as in TOML; bare words are texts.
     Raises:
-        GsbaError: unreadable file, unknown key, or a value out of range, with the allowed values.
+        GsbaError: unreadable file, unknown key, a value out of range, with the allowed values, or
+            overrides that are one text.
     """
-    tree = read_toml(path) if path else {}
+    if isinstance(overrides, str):
+        raise GsbaError("overrides: give a list of texts, each stage.key=value")
+    tree = read_toml(Path(path)) if path else {}
     _check_keys(tree, RefineSettings, (), str(path))
     for override in overrides:
         keys, value = _parse_override(override)

@@ -14,6 +14,7 @@ from gsba.cli.splat import splat_settings
 from gsba.config import RefineSettings
 from gsba.config_file import PRESETS, load_config, to_toml
 from gsba.log import GsbaError
+from gsba.store.finished import load_run
 
 CONFIGS = sorted(PRESETS.glob("*.toml"))
 
@@ -126,6 +127,12 @@ def test_overrides_win_over_the_file(tmp_path: Path) -> None:
 )
 def test_wrong_settings_are_one_clear_line(override: str, message: str) -> None:
     refused(re.escape(message), load_config, None, [override])
+
+
+def test_a_path_may_be_a_text(tmp_path: Path) -> None:
+    assert load_config("fast") == load_config(Path("fast"))
+    refused("overrides: give a list", load_config, None, "seed=1")
+    refused("is not a gsba run", load_run, str(tmp_path))
 
 
 def test_unusable_files_are_one_clear_line(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import gtsam
 import numpy as np
 
 from factors import BearingTerm, Block, FaceCameras, ReprojectionTerm, Term
+from factors.system_layout import is_hard_constraint
 from gsba.bundle.observation_noise import face_roots
 from gsba.bundle.pose_variables import X
 from gsba.camera.rig import RIG_R_FACE, CubeRig
@@ -140,15 +141,41 @@ class FamilyTerms:
         return kept(values, keys) if keys else None
 
 
+def _check_complete(family: Family) -> None:
+    """GsbaError where a family lacks a name or digest, or gives residuals that nothing asks for."""
+    kind = type(family)
+    if Family not in kind.__mro__:
+        raise GsbaError(f"families: {family!r} is no object of a subclass of gsba.Family")
+    for attribute in ("name", "digest"):
+        if not hasattr(family, attribute):
+            raise GsbaError(f"family {kind.__name__} has no {attribute}: give it one, a text")
+    gives = {
+        method
+        for method in ("graph", "blocks", "landmark_terms", "fitted")
+        if getattr(kind, method) is not getattr(Family, method)
+    }
+    if not gives:
+        raise GsbaError(
+            f"family {family.name} has no residuals: define graph, blocks or landmark_terms"
+        )
+    if "landmark_terms" in gives and not family.observes_points:
+        raise GsbaError(
+            f"family {family.name}: its landmark_terms count only with observes_points = True"
+        )
+
+
 @dataclass(frozen=True, slots=True)
 class Families:
-    """The families of a run, and the frames of their snapshots."""
+    """The families of a run, and the frames of their snapshots. GsbaError: two have one name, or
+    one has no name, no digest or no residuals."""
 
     members: tuple[Family, ...] = ()
     names: tuple[str, ...] = ()  # (F) of the frames
     timestamps: np.ndarray = field(default_factory=lambda: np.zeros(0))  # (F,) float64 seconds
 
     def __post_init__(self) -> None:
+        for family in self.members:
+            _check_complete(family)
         names = [family.name for family in self.members]
         for name in {name for name in names if names.count(name) > 1}:
             raise GsbaError(f"two families are named {name}: give each a name of its own")
@@ -201,7 +228,7 @@ class Families:
 
         Raises:
             GsbaError: a factor on a variable that has no value, or a variable that two families
-            have, or whose key is not a family's.
+            have, or whose key is not a family's; a hard constraint, or no graph.
         """
         snapshot = self.snapshot(solved, maps)
         held = any(family.holds_gauge(snapshot) for family in self.members)
@@ -234,8 +261,18 @@ def _terms_of(families: Sequence[Family], snapshot: MapSnapshot) -> FamilyTerms:
                 )
         known = poses | set(own.keys())
         factors, arrays = family.graph(snapshot), tuple(family.blocks(snapshot))
+        if not isinstance(factors, gtsam.NonlinearFactorGraph):
+            raise GsbaError(
+                f"family {family.name}: graph() returns {type(factors).__name__}, not a "
+                "gtsam.NonlinearFactorGraph"
+            )
         for n in range(factors.size()):
             _check_known(family, f"factor {n}", factors.at(n).keys(), known)
+            if is_hard_constraint(factors.at(n)):
+                raise GsbaError(
+                    f"family {family.name}: factor {n} is a hard constraint "
+                    "(noiseModel.Constrained): give it a small sigma such as 1e-6"
+                )
         for block in arrays:
             _check_known(family, "a block", block.keys, known)
         values.insert(own)

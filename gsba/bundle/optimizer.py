@@ -18,6 +18,8 @@ from gsba.types import Iteration, JointErrors
 
 logger = logging.getLogger(__name__)
 
+_COST_PRECISION = 1e-9  # part of a cost below which its change may be rounding
+
 
 @dataclass(frozen=True, slots=True)
 class SolverOptions:
@@ -140,18 +142,31 @@ def optimize(
     result.
 
     Args:
-        graph: native or user factors, on variables of any type.
+        graph: native or user factors, on variables of any type; none is a hard constraint.
         blocks: batched factors on Pose3 variables; their landmarks move along.
         options: tolerances and damping; None = the defaults.
         callback: called with each attempt and the best values so far.
 
     Raises:
-        GsbaError: the cost at the start is not finite.
+        GsbaError: the cost at the start or a Jacobian is not finite, a variable has no value, or a
+            factor is a hard constraint (`gtsam.noiseModel.Constrained`).
     """
     options = options or SolverOptions()
     for block in blocks:
         block.refresh(values)
-    return minimize(reduced_system(graph, blocks, values), values, options, callback)
+    try:
+        system = reduced_system(graph, blocks, values)
+    except ValueError as error:
+        raise GsbaError(f"{error}") from None
+    return minimize(system, values, options, callback)
+
+
+def _linearized(system: System, values: gtsam.Values) -> dict[str, float]:
+    """Cost of each family of a system that is linearized. GsbaError: a Jacobian is not finite."""
+    try:
+        return system.linearize(values)
+    except FloatingPointError as error:
+        raise GsbaError(f"{error}: guard its divisions by zero") from None
 
 
 @threadpool_limits.wrap(limits=1, user_api="blas")  # sums keep their order, fronts are small
@@ -162,18 +177,19 @@ def minimize(
     callback: Callable[[Iteration, gtsam.Values], None] | None = None,
 ) -> OptimizeResult:
     """Minimize the cost of a system by Levenberg-Marquardt: `optimize`, of any system. GsbaError:
-    the cost at the start is not finite."""
+    the cost at the start or a Jacobian is not finite."""
     history = _History(callback)
 
     def result(converged: bool, reason: str) -> OptimizeResult:
         return OptimizeResult(values, tuple(history.steps), converged, reason)
 
-    costs = system.linearize(values)
+    costs = _linearized(system, values)
     bad = [name for name, part in costs.items() if not np.isfinite(part)]
     if bad:
         raise GsbaError(f"the cost of {', '.join(bad)} is not finite at the start: check its input")
     cost = sum(costs.values())
     damping = _Damping(options.lambda_initial)
+    promised = 0.0  # largest decrease predicted for a step rejected since the last accepted one
     history.add(values, cost, costs, damping.value, True)
     for _ in range(options.max_iterations):
         negligible = options.relative_tolerance * cost
@@ -185,20 +201,23 @@ def minimize(
         if steps is not None:
             trial = system.retract(values, steps)
             trial_cost, predicted = system.propose(trial, steps), system.predicted_decrease()
+            promised = max(promised, predicted)
         if not trial_cost <= cost:  # also where it is not a number
             history.add(values, trial_cost, {}, used, False)
             if predicted <= negligible:
+                if promised > max(negligible, _COST_PRECISION * cost):
+                    return result(False, "no step decreases the cost as the Jacobians predict")
                 return result(True, "no step decreases the cost")
             if not damping.raised():
                 return result(False, "no damping gives a good step")
             continue
         system.accept(trial)
-        values, decrease = trial, cost - trial_cost
+        values, decrease, promised = trial, cost - trial_cost, 0.0
         damping.lower(decrease / predicted if predicted > 0 else 1.0)
         # a small step says nothing about convergence where damping made it small, and a long chain
         # of frames bends by modes of 1e-6 of the diagonal
         converged = decrease <= negligible and used <= 1e-6
-        costs = system.costs(values) if converged else system.linearize(values)
+        costs = system.costs(values) if converged else _linearized(system, values)
         cost = sum(costs.values())
         history.add(values, cost, costs, used, True)
         if converged:
@@ -229,7 +248,7 @@ def marginal_covariances(
     for block in blocks:
         block.refresh(values)
     system = reduced_system(graph, blocks, values, list(pairwise(keys)))
-    system.linearize(values)
+    _linearized(system, values)
     found = system.covariances(num_draws, np.random.default_rng(seed))
     if found is None:
         nothing = np.full((num_draws, num, 6), np.nan, np.float32)

@@ -1,9 +1,11 @@
 """What a run leaves behind: poses, cloud, datasets and the report."""
 
+import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from gsba.bundle.families import Family, MapSnapshot
 from gsba.bundle.gps_factors import GpsFactors
 from gsba.bundle.map_strength import MAX_SCALE_SIGMA
 from gsba.bundle.reconstruction import world_scale
@@ -14,6 +16,7 @@ from gsba.config_file import to_toml
 from gsba.disk import write_json, write_text
 from gsba.export import ExportFormat, ExportOptions, export_all, seen_by, write_points
 from gsba.frames.recordings import names_of_cameras, own_timestamps
+from gsba.log import GsbaError
 from gsba.pipeline.prior import Prior
 from gsba.pipeline.run import Run
 from gsba.pipeline.stage_titles import title_of
@@ -136,13 +139,26 @@ def _write_calibrations(state: State, result: Reconstruction, cameras: Cameras) 
             store.claim(path)
 
 
+def of_family(family: Family, snapshot: MapSnapshot) -> Any:
+    """Part of a family in the report. GsbaError: JSON cannot hold it."""
+    found = plain(family.report(snapshot))
+    try:
+        json.dumps(found)
+    except (TypeError, ValueError) as error:
+        raise GsbaError(
+            f"family {family.name}: report.json cannot hold what its report() returns ({error}): "
+            "return numbers, texts, lists and dictionaries"
+        ) from None
+    return found
+
+
 def _report(state: State, result: Reconstruction) -> dict[str, Any]:
     run, rounds = state.run, state.run.journal.rounds
     solver = [{"stage": name, "rounds": some} for name, some in rounds.items()]
     costs, again_s = tuple(run.store.records.values()), run.store.seconds_again
     stages = StageLog(costs, run.journal.counts, solver, again_s)
     snapshot = run.families.snapshot(state.solution, state.prior.parts)
-    of_families = {family.name: plain(family.report(snapshot)) for family in run.families.members}
+    of_families = {family.name: of_family(family, snapshot) for family in run.families.members}
     of_families = {name: report for name, report in of_families.items() if report}
     gauge = _gauge(run, state.prior)
     found = _findings(state, result, of_families.pop(GpsFactors.name, None))

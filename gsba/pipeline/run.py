@@ -128,14 +128,14 @@ class Run:
         ]
         if any(imu is not None and not own.all() for imu, own in sensors):
             raise GsbaError("--imu: nothing says when frames are from: pass --timestamps or --fps")
-        for family in evidence.families:
-            if family.name in (TrajectoryPrior.name, GyroTurns.name):
-                raise GsbaError(f"family {family.name}: gsba has one of this name; rename yours")
         rig = cubemap.rig_for(frames.formats[0], settings.cubemap)
         own: list[Family] = [Bearings(), Reprojections(rig)]
         own = [family for family in own if family.name in settings.factors]
         members = (*own, *evidence.families)
         families = Families(members, frames.names, frames.timestamps)
+        for family in evidence.families:
+            if family.name in (TrajectoryPrior.name, GyroTurns.name):
+                raise GsbaError(f"family {family.name}: gsba has one of this name; rename yours")
         if not families.observing_points.members:
             raise GsbaError("factors: no family observes points; add bearing or reprojection")
         paths = [*(path for group in frames.paths for path in group), *frames.mask_paths]

@@ -12,9 +12,10 @@ from gsba.store.store import load_stage
 from gsba.types import FrameSet, Reconstruction
 
 
-def load_run(out: Path, map_number: int = 1) -> tuple[Reconstruction, FrameSet]:
+def load_run(out: Path | str, map_number: int = 1) -> tuple[Reconstruction, FrameSet]:
     """One map of a finished run, 1 = the largest, and its frames; GsbaError if `out` is no finished
     run, was edited, or has no such map."""
+    out = Path(out)
     reconstruction = load_stage(out, "reconstruction", Reconstruction)
     frames = load_stage(out, "frames", FrameSet)
     if not _fit_together(reconstruction, frames):

@@ -8,9 +8,9 @@ import pytest
 from refusals import refused
 from synthetic import RIG, World, drifted, make_world
 
-from factors import Block, block_factor
+from factors import Block, Term, block_factor
 from factors.block import PoseSystem
-from gsba import Family, MapSnapshot, X
+from gsba import Family, MapSnapshot, PointObservations, X
 from gsba.bundle import adjustment, gauge
 from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.families import Bearings, Families, kept, restored
@@ -253,6 +253,44 @@ def test_what_cannot_be_solved_is_refused(world: World) -> None:
         Families((Sideways(measured), SidewaysInOneBlock(measured))).terms(start)
     with pytest.raises(GsbaError, match="factor 20 is about variable x20, which has no value"):
         Families((Sideways(np.append(measured, 0)),)).terms(start)
+
+    class Hard(Sideways):
+        def graph(self, snapshot: MapSnapshot) -> gtsam.NonlinearFactorGraph:
+            graph, hard = gtsam.NonlinearFactorGraph(), gtsam.noiseModel.Constrained.All(6)
+            graph.add(gtsam.PriorFactorPose3(X(1), gtsam.Pose3(), hard))
+            return graph
+
+    class Forgetful(Sideways):
+        def graph(self, snapshot: MapSnapshot) -> gtsam.NonlinearFactorGraph:
+            super().graph(snapshot)
+
+    refused("family sideways: factor 0 is a hard", Families((Hard(measured),)).terms, start)
+    refused(r"graph\(\) returns NoneType", Families((Forgetful(measured),)).terms, start)
+
+
+class _Nameless(Family):
+    digest = "1"
+
+
+class _Misspelt(Family):
+    name, digest = "misspelt", "1"
+
+    def graphs(self, snapshot: MapSnapshot) -> gtsam.NonlinearFactorGraph:
+        return gtsam.NonlinearFactorGraph()
+
+
+class _Unasked(Family):
+    name, digest = "unasked", "1"
+
+    def landmark_terms(self, observed: PointObservations) -> list[Term]:
+        return []
+
+
+def test_a_family_that_could_not_take_part_is_refused() -> None:
+    refused("_Misspelt'> is no object of a subclass of gsba.Family", Families, (_Misspelt,))
+    refused("family _Nameless has no name", Families, (_Nameless(),))
+    refused("family misspelt has no residuals: define graph", Families, (_Misspelt(),))
+    refused("family unasked: .* observes_points = True", Families, (_Unasked(),))
 
 
 def test_values_so_far_are_shown_to_families(world: World) -> None:

@@ -353,6 +353,60 @@ def test_bad_steps_are_refused_and_bad_starts_reported(world):
     refused("graph is not finite", optimize, graph, values, [world.block()])
 
 
+def _pulled(jacobian):
+    """A factor on x0 with this Jacobian."""
+
+    def error(_factor, _values, jacobians):
+        if jacobians is not None:
+            jacobians[0] = jacobian
+        return np.ones(1)
+
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(1), [X(0)], error)
+
+
+def test_a_jacobian_that_is_not_finite_is_named(world):
+    for bad in (np.nan, np.inf):
+        graph, row = gtsam.NonlinearFactorGraph(world.graph), np.eye(6)[:1]
+        row[0, 3] = bad
+        graph.add(_pulled(row))
+        refused("the Jacobian of the factor on x0 is not finite", optimize, graph, world.values)
+
+
+def test_a_jacobian_of_the_wrong_sign_does_not_converge(world):
+    def height(sign):
+        def error(_factor, values, jacobians):
+            pose = values.atPose3(X(0))
+            if jacobians is not None:
+                row = np.append(np.zeros(3), pose.rotation().matrix()[1])
+                jacobians[0] = sign * row[None]
+            return np.array([pose.y() - 1.0])
+
+        graph = gtsam.NonlinearFactorGraph(world.graph)
+        noise = gtsam.noiseModel.Isotropic.Sigma(1, 1e-3)
+        graph.add(gtsam.CustomFactor(noise, [X(0)], error))
+        return graph
+
+    assert optimize(height(1.0), world.values).converged
+    result = optimize(height(-1.0), world.values)
+    assert not result.converged and "as the Jacobians predict" in result.reason
+
+
+def test_hard_constraints_are_refused(world):
+    hard = gtsam.noiseModel.Constrained.All(6)
+    for factor in (
+        gtsam.PriorFactorPose3(X(3), world.truth[3], hard),
+        gtsam.NonlinearEqualityPose3(X(3), world.truth[3]),
+    ):
+        graph = gtsam.NonlinearFactorGraph(world.graph)
+        graph.add(factor)
+        refused("the factor on x3 is a hard constraint", optimize, graph, world.values)
+
+
+def test_nothing_is_solved_at_once(world):
+    result = optimize(gtsam.NonlinearFactorGraph(), world.values)
+    assert result.converged and result.cost == 0 and result.values.equals(world.values, 0.0)
+
+
 def test_interrupt_passes_through(world):
     def stop(_iteration, _values):
         raise KeyboardInterrupt
@@ -373,8 +427,49 @@ def test_bad_terms_are_named(world):
         )
     with pytest.raises(ValueError, match="positive"):
         LandmarkBlock(world.keys, np.zeros((1, 3)), [BearingTerm(one, one, np.eye(3)[:1], 0.0)])
-    with pytest.raises(ValueError, match="no value"):
-        optimize(world.graph, gtsam.Values())
+    refused("no value", optimize, world.graph, gtsam.Values())
+
+
+def test_what_would_be_taken_for_something_else_is_refused(world):
+    """Inputs of a plausible type and shape that would give another problem without a word."""
+    one, ray, points = np.array([0]), np.eye(3)[:1], np.ones((2, 3))
+
+    def block(frames=one, rays=ray, keys=world.keys, points_world=points):
+        LandmarkBlock(keys, points_world, [BearingTerm(frames, one, rays, SIGMA_RAD)])
+
+    block()
+    for message, given in {
+        "of length one": {"rays": 2 * ray},
+        "integers": {"frames": np.array([0.5])},
+        "once": {"keys": [X(0), X(0)]},
+        r"\(J, 3\), not \(3, 2\)": {"points_world": points.T},
+    }.items():
+        with pytest.raises(ValueError, match=message):
+            block(**given)
+    noise = gtsam.noiseModel.Unit.Create(2)
+    for bad in (2 * ray[0], np.full(3, np.nan), ray):
+        with pytest.raises(ValueError, match="of length one"):
+            BearingFactor(X(0), L(0), bad, noise)
+    for face in (-1, 4):
+        with pytest.raises(ValueError, match="out of range"):
+            ReprojectionFactor(X(0), L(0), np.zeros(2), face, CAMERAS, noise)
+    for focals in (np.zeros(4), np.full(4, np.nan), np.ones(3)):
+        with pytest.raises(ValueError, match="focal lengths"):
+            FaceCameras(CAMERAS.rig_R_faces, focals, CAMERAS.principals)
+
+
+def test_factors_keep_their_measurement(world):
+    """The caller's array may be filled anew for the next factor."""
+    values, noise = gtsam.Values(world.values), gtsam.noiseModel.Unit.Create(2)
+    values.insert(L(0), world.truth[0].transformFrom(np.array([0.2, 0.1, 3.0])))
+    ray, pixel = np.array([0.0, 0.0, 1.0]), np.array([250.0, 260.0])
+    factors = [
+        BearingFactor(X(0), L(0), ray, noise),
+        ReprojectionFactor(X(0), L(0), pixel, 0, CAMERAS, noise),
+    ]
+    before = [factor.error(values) for factor in factors]
+    ray[:], pixel[:] = [0.0, 1.0, 0.0], 0.0
+    assert [factor.error(values) for factor in factors] == before
 
 
 def test_landmarks_are_eliminated_in_runs_of_any_length(world, monkeypatch):

@@ -14,7 +14,7 @@ import pytest
 from one_gallery import gallery
 
 from factors.check import jacobian_errors
-from gsba import RefineSettings, RunResult
+from gsba import PointObservations, RefineSettings, RunResult
 from gsba.camera.sphere import erp_directions
 from gsba.demo import make_walk
 from gsba.demo.raycast import ranges
@@ -196,6 +196,17 @@ def test_points_are_refined_by_a_residual_of_ones_own(walk: Path, out: Path) -> 
     ]
     assert all("bearing" not in some and some["panorama_pixels"] > 0 for some in costs)
     assert _scale_and_error(walk, result.reconstruction.world_T_rigs)[1] < 5e-3
+
+
+def test_pixels_of_two_lenses_are_seen_from_each() -> None:
+    import panorama_pixels
+
+    bearings, indices = np.eye(3), np.arange(3)  # the second one is at the pole
+    origins = np.array([[0.0, 0, 0.02], [0.0, 0, 0.02], [0.0, 0, -0.02]])
+    given = indices, indices, bearings, np.full(3, 1e-3), None
+    observed = PointObservations(*given, origins, np.zeros(3, np.uint8), np.zeros((3, 2)))
+    (term,) = panorama_pixels.PanoramaPixels().landmark_terms(observed)
+    np.testing.assert_array_equal(term.origins_rig, origins[[0, 2]])
 
 
 def test_tags_set_the_scale(walk: Path, out: Path) -> None:

@@ -196,3 +196,18 @@ def test_tangent_basis_is_orthonormal():
     product = np.einsum("nij,nkj->nik", frame, frame)
     assert np.allclose(product, np.eye(3), atol=1e-12)
     assert np.allclose(np.linalg.det(frame), 1)
+
+
+def test_a_jacobian_that_is_no_number_does_not_pass():
+    """Python's max() ignores NaN after a first number."""
+
+    def error(_factor, _values, jacobians):
+        if jacobians is not None:
+            jacobians[0], jacobians[1] = np.zeros((1, 6)), np.full((1, 3), np.nan)
+        return np.zeros(1)
+
+    values = gtsam.Values()
+    values.insert(X(0), gtsam.Pose3())
+    values.insert(X(1), np.zeros(3))
+    factor = gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(1), [X(0), X(1)], error)
+    assert not max(jacobian_errors(factor, values).values()) < 1e-6

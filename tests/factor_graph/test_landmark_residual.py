@@ -7,6 +7,7 @@ import gtsam
 import numpy as np
 import pytest
 from gtsam.symbol_shorthand import L, X
+from numba import njit
 
 from factors import (
     BearingTerm,
@@ -147,3 +148,45 @@ def test_its_factor_shows_whether_the_jacobian_is_right(function: Callable[..., 
         X(0), L(0), measured, gtsam.noiseModel.Isotropic.Sigma(2, 0.1)
     )
     assert max(jacobian_errors(factor, values).values()) < 1e-8
+
+
+def _pinhole(measured, vector, residual, jacobian):
+    """Pixels of a pinhole, everything written."""
+    residual[:], jacobian[:] = 0.0, 0.0
+    return _sparse_pinhole(measured, vector, residual, jacobian)
+
+
+@njit
+def _sparse_pinhole(measured, vector, residual, jacobian):
+    """The same with no zero written: neither of the Jacobian, nor anything behind the camera."""
+    if vector[2] <= 0.0:
+        return False
+    for c in range(2):
+        residual[c] = vector[c] / vector[2] - measured[c]
+        jacobian[c, c] = 1.0 / vector[2]
+        jacobian[c, 2] = -vector[c] / vector[2] ** 2
+    return True
+
+
+def test_what_a_residual_does_not_write_is_zero() -> None:
+    points, values, frames, owners, vectors = _world()
+    keys, measured = [X(f) for f in range(NUM_FRAMES)], np.zeros((len(frames), 3))
+    blocks = [
+        LandmarkBlock(keys, points, [LandmarkTerm(frames, owners, measured, _residual(function))])
+        for function in (_pinhole, _sparse_pinhole.py_func)
+    ]
+    (wanted,), (seen,) = blocks[0].residuals(values)
+    assert np.array_equal(seen, vectors[:, 2] > 0)
+    np.testing.assert_array_equal(blocks[1].residuals(values)[0][0], wanted)
+    systems = [block.linearize(values) for block in blocks]
+    np.testing.assert_array_equal(systems[1].diagonal, systems[0].diagonal)
+
+
+def _says_nothing(measured, vector, residual, jacobian):
+    """A residual that does not say whether its point is seen."""
+    residual[0] = vector[0] - measured[0]
+
+
+def test_a_residual_says_whether_its_point_is_seen() -> None:
+    with pytest.raises(TypeError, match="_says_nothing must return True or False on every path"):
+        LandmarkResidual(_says_nothing)

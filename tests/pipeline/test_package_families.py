@@ -5,12 +5,17 @@ from importlib.metadata import EntryPoint
 from types import SimpleNamespace
 
 import gtsam
+import numpy as np
 import pytest
+from refusals import refused
 
 from gsba import Family, MapSnapshot
+from gsba.bundle.families import Families
 from gsba.config_file import load_config
 from gsba.log import GsbaError
 from gsba.pipeline import inputs
+from gsba.pipeline.outputs import of_family
+from gsba.types import Solution
 
 
 class _Barometer(Family):
@@ -55,3 +60,13 @@ def test_a_package_that_does_not_load_is_named() -> None:
     settings = load_config(None, ['factors=["bearing", "broken"]'])
     with pytest.raises(GsbaError, match="family broken: its package cannot be loaded"):
         inputs.families_of(object(), settings)  # type: ignore[arg-type]
+
+
+def test_a_report_that_json_cannot_hold_is_the_family_s() -> None:
+    class Telling(_Barometer):
+        def report(self, snapshot: MapSnapshot) -> dict:
+            return {"bias": snapshot.variables}
+
+    frame = Families((Telling(None, None),), ("0",), np.zeros(1))
+    snapshot = frame.snapshot(Solution.without_points(np.eye(4)[None]))
+    refused(r"family barometer: report.json cannot hold", of_family, *frame.members, snapshot)
