@@ -32,7 +32,7 @@ logger = logging.getLogger(__name__)
 def export(
     reconstruction: Reconstruction,
     frames: FrameSet,
-    out: Path,
+    out: Path | str,
     to: ExportFormat,
     face_size: int | None = None,
     placement: Placement | None = None,
@@ -60,7 +60,7 @@ def export(
             those to hold out, or the disk cannot be written; nothing is left behind then.
     """
     options = ExportOptions(face_size, placement, **choices)
-    export_all(reconstruction, frames, {to: out}, options, workers)
+    export_all(reconstruction, frames, {to: Path(out)}, options, workers)
 
 
 def export_all(

@@ -84,7 +84,7 @@ def test_the_scene_tells_blender_its_timeline_and_pictures(tmp_path: Path) -> No
 def test_a_day_fits_blenders_timeline(tmp_path: Path) -> None:
     frames = panoramas(tmp_path / "frames")
     frames = replace(frames, timestamps=np.linspace(0, 86400, len(frames)))
-    export(reconstruction(), frames, tmp_path / "out", ExportFormat.GLTF)
+    export(reconstruction(), frames, str(tmp_path / "out"), ExportFormat.GLTF)
     document = _document(tmp_path / "out/scene.glb")
     assert document["scenes"][0]["extras"]["fps"] == 11
     assert document["nodes"][-2]["extras"]["frame"] == 11 * 86400
