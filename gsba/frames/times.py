@@ -2,6 +2,7 @@
 
 import logging
 import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -173,6 +174,12 @@ def frame_times(
         if not order_suffices:
             raise
         _log.info("frames are taken in the order of their names (%s)", error)
+        if films := _films(names):
+            _log.warning(
+                "names of frames are numbered anew after %s: if these are several films, give each "
+                "a folder of its own (gsba refine A B), as a place that looks alike may join them",
+                ", ".join(f"'{name}'" for name in films),
+            )
         return _relative_times(names) / (fps or 1.0), False
     return given, True
 
@@ -217,6 +224,14 @@ def _relative_times(names: Sequence[str]) -> np.ndarray:
     usual = float(np.median(steps))
     even = usual > 0 and 2 * np.count_nonzero(steps == usual) > len(steps) and steps.min() > 0
     return numbers / usual if even else order
+
+
+def _films(names: Sequence[str]) -> list[str]:
+    """Parts of names before their last digits, if there are several, each of three frames or more;
+    [] = all are of one film."""
+    split = [re.fullmatch(r"(.*?)[0-9]+", name) for name in names]
+    counts = Counter(m[1] if m else "" for m in split)
+    return list(counts) if len(counts) > 1 and min(counts.values()) >= 3 else []
 
 
 def _last_digits(names: Sequence[str]) -> list[str] | None:

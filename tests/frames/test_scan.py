@@ -283,6 +283,19 @@ def test_the_order_of_names_suffices_without_a_trajectory(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(
+    ("names", "told"),
+    [("a_1 a_2 a_3 b2_1 b2_2 b2_3", "anew after 'a_', 'b2_'"), ("a_1 a_2 a_3 b_1 b_2", "")],
+)
+def test_names_of_two_films_are_told(
+    names: str, told: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    write_images(tmp_path, *names.split())
+    scan(tmp_path, order_suffices=True)
+    warnings = [one.getMessage() for one in caplog.records if one.levelname == "WARNING"]
+    assert len(warnings) == bool(told) and told in "".join(warnings)
+
+
+@pytest.mark.parametrize(
     ("names", "expected"),
     [
         ("0030 0060 0120 0150 0180", [0, 1, 3, 4, 5]),
