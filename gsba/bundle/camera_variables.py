@@ -12,7 +12,7 @@ from factors.camera_block import CameraBlock, sightings_of
 from factors.camera_rows import CameraVariables, LensVariables, half_baseline, lens_sizes, vector
 from gsba.bundle import lens_axes, readout, self_calibration
 from gsba.bundle.adjustment import AdjustmentContext
-from gsba.bundle.pose_variables import X, diagonal_noise
+from gsba.bundle.pose_variables import X
 from gsba.bundle.readout import CameraEstimate, CameraEstimates
 from gsba.camera.fisheye import by_move, project, rotation_of
 from gsba.config import CameraSettings
@@ -106,7 +106,7 @@ class CameraUnknowns:
         for f in range(len(own.values)):
             widened = moves_alike if solved_for[own.cameras[f]] else 1.0
             sigmas = own.sigmas_of(f) * np.repeat([1.0, widened], 3)
-            model = diagonal_noise(sigmas)
+            model = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
             graph.add(gtsam.PriorFactorVector(W(f), np.zeros(6), model))
         return graph
 
@@ -327,5 +327,5 @@ def _add(
 ) -> None:
     """A variable that is believed to be near zero."""
     values.insert(key, np.array(value))
-    model = diagonal_noise(sigmas)
+    model = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
     graph.add(gtsam.PriorFactorVector(key, np.zeros(len(value)), model))

@@ -21,16 +21,10 @@ def poses_of(values: gtsam.Values, num_frames: int) -> np.ndarray:
     return np.array([values.atPose3(X(f)).matrix() for f in range(num_frames)])
 
 
-def diagonal_noise(sigmas: np.ndarray) -> gtsam.noiseModel.Diagonal:
-    """Independent noise of standard deviations (n,), of at least 1e-8: GTSAM makes hard constraints
-    of less."""
-    return gtsam.noiseModel.Diagonal.Sigmas(np.maximum(sigmas, 1e-8))
-
-
 def pose_noise(rotation: float, translation: float) -> gtsam.noiseModel.Diagonal:
     """Independent noise of a pose's tangent, the same along all axes: standard deviations of the
     rotation, radians, and of the translation, map units."""
-    return diagonal_noise(np.array([rotation] * 3 + [translation] * 3))
+    return gtsam.noiseModel.Diagonal.Sigmas(np.array([rotation] * 3 + [translation] * 3))
 
 
 def fixed_scale(
@@ -51,6 +45,6 @@ def fixed_scale(
             held.add(gtsam.RangeFactorPose3(X(first), X(int(rows[far])), distance, noise))
         if first > 0:
             fixed = gtsam.Pose3(world_T_rigs[first])
-            noise = pose_noise(sigma, sigma * distance)
+            noise = pose_noise(sigma, sigma * max(distance, 1e-12))
             held.add(gtsam.PriorFactorPose3(X(first), fixed, noise))
     return held

@@ -9,7 +9,7 @@ import numpy as np
 from factors import Block, PoseSystem, RobustLoss, tangent_basis
 from gsba.bundle.adjustment import MIN_NOISE
 from gsba.bundle.optimizer import SolverOptions, marginal_covariances, optimize
-from gsba.bundle.pose_variables import X, diagonal_noise, values_of
+from gsba.bundle.pose_variables import X, values_of
 from gsba.camera.projections import Projection
 from gsba.types.records import with_rows
 
@@ -222,7 +222,7 @@ def fit(
     values, graph = values_of(starts), gtsam.NonlinearFactorGraph()
     for c, (projection, prior) in enumerate(zip(projections, priors, strict=True)):
         values.insert(K(c), _no_step(projection))
-        noise = diagonal_noise(prior.sigmas)
+        noise = gtsam.noiseModel.Diagonal.Sigmas(prior.sigmas)
         graph.push_back(gtsam.PriorFactorVector(K(c), prior.step, noise))
     noises = np.ones(len(pictures))
     for scale in scales:
