@@ -96,6 +96,7 @@ class SystemLayout:
 
 
 def is_hard_constraint(factor: gtsam.NonlinearFactor) -> bool:
-    """True if a residual of a factor has no noise: normal equations have no weight for it."""
+    """True if a residual of a factor has no noise: normal equations have no weight for it. (GTSAM
+    calls a noise below 1e-8 constrained, too, and weights it rightly.)"""
     noise = factor.noiseModel() if isinstance(factor, gtsam.NoiseModelFactor) else None
-    return noise is not None and noise.isConstrained()
+    return noise is not None and noise.isConstrained() and not noise.sigmas().all()

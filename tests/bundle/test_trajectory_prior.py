@@ -6,6 +6,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from synthetic import loop_walk
 
+from factors.system_layout import is_hard_constraint
 from gsba.bundle import pose_variables
 from gsba.bundle.families import Families
 from gsba.bundle.pose_variables import X
@@ -146,6 +147,14 @@ def test_fixed_scale_holds_the_extent() -> None:
     assert held.error(_values(coarse)) == pytest.approx(0, abs=1e-9)
     assert held.error(_values(bigger)) == pytest.approx(0.5 * 1e4**2, rel=1e-6)
     assert pose_variables.fixed_scale(np.stack([np.eye(4)] * 3)).size() == 0
+
+
+def test_a_frame_alone_and_tiny_maps_are_no_hard_constraints() -> None:
+    poses = loop_walk(5)
+    poses[2:, :3, 3] *= 1e-4
+    held = pose_variables.fixed_scale(poses, np.array([0, 0, 1, 1, 2]))
+    assert held.size() == 4
+    assert not any(is_hard_constraint(held.at(n)) for n in range(4))
 
 
 def test_turns_of_a_gyro_hold_rotations_and_nothing_else() -> None:
