@@ -285,12 +285,9 @@ def overlap_ratios(result: Reconstruction, recordings: np.ndarray) -> np.ndarray
     to the power of how many times as long the step is. NaN where that is hardly any, or where a
     step beside it is missing or of another one of recordings (F,)."""
     points = [np.unique(result.observation_points[rows]) for rows in result.observations_by_frame()]
-    overlaps = np.array(
-        [
-            len(np.intersect1d(*two, assume_unique=True)) / max(len(np.union1d(*two)), 1)
-            for two in pairwise(points)
-        ]
-    )
+    common = [len(np.intersect1d(*two, assume_unique=True)) for two in pairwise(points)]
+    each = np.array([len(some) for some in points])
+    overlaps = common / np.maximum(each[:-1] + each[1:] - common, 1)
     lengths = np.linalg.norm(np.diff(result.world_T_rigs[:, :3, 3], axis=0), axis=1)
     found = np.full(len(overlaps), np.nan)
     for step in range(1, len(overlaps) - 1):

@@ -229,18 +229,22 @@ def _relative_times(names: Sequence[str]) -> np.ndarray:
 def _films(names: Sequence[str]) -> list[str]:
     """Parts of names before their last digits, if there are several, each of three frames or more;
     [] = all are of one film."""
-    split = [re.fullmatch(r"(.*?)[0-9]+", name) for name in names]
-    counts = Counter(m[1] if m else "" for m in split)
+    counts = Counter(prefix for prefix, _ in _numbered(names))
     return list(counts) if len(counts) > 1 and min(counts.values()) >= 3 else []
 
 
 def _last_digits(names: Sequence[str]) -> list[str] | None:
     """Digits (F,) that names end in after a common prefix; None = other names."""
-    split = [re.fullmatch(r"(.*?)([0-9]+)", name) for name in names]
-    found = [m.groups() for m in split if m]
-    if len(found) < len(names) or len({prefix for prefix, _ in found}) != 1:
+    found = _numbered(names)
+    if not all(digits for _, digits in found) or len({prefix for prefix, _ in found}) != 1:
         return None
     return [digits for _, digits in found]
+
+
+def _numbered(names: Sequence[str]) -> list[tuple[str, str]]:
+    """Each name's prefix and the digits that it ends in; both empty where there are none."""
+    split = [re.fullmatch(r"(.*?)([0-9]+)", name) for name in names]
+    return [(m[1], m[2]) if m else ("", "") for m in split]
 
 
 def _times_from_names(names: Sequence[str]) -> np.ndarray | None:

@@ -25,8 +25,9 @@ from gsba.types import FACES, Features
 
 # Pairs of faces that may show the same where the heading is unknown, as cameras are held upright.
 _UPRIGHT_FACES = [*product(range(4), range(4)), (4, 4), (5, 5)]
-_MIN_ALIKE_SHARE = 0.1  # of a face's mutual nearest neighbours: half of the pairs of faces have
-_MAX_PAIRS_OF_FACES = 9  # nine tenths of the true matches (benchmarks/results/tours.md)
+# Half of the pairs of faces have nine tenths of the true matches (benchmarks/results/tours.md).
+_MIN_ALIKE_SHARE = 0.1  # of a face's mutual nearest neighbours
+_MAX_PAIRS_OF_FACES = 9  # of two frames, where nothing predicts the pose
 
 
 def make_matcher(settings: RefineSettings, weights: Mapping[str, Path], size: int) -> Matcher:

@@ -158,7 +158,7 @@ def _pinhole(measured, vector, residual, jacobian):
 
 @njit
 def _sparse_pinhole(measured, vector, residual, jacobian):
-    """The same with no zero written: neither of the Jacobian, nor anything behind the camera."""
+    """The same, which leaves zeros of the Jacobian to the caller, and all where it is invisible."""
     if vector[2] <= 0.0:
         return False
     for c in range(2):
