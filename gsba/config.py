@@ -128,7 +128,7 @@ class RoundSettings(_Settings):
 class PatchSettings(_Settings):
     """Patches around the map's points, aligned to every frame that shows them."""
 
-    rounds: int = Field(default=4, ge=0)  # most rounds of alignment and bundle adjustment, which
+    rounds: int = Field(default=8, ge=0)  # most rounds of alignment and bundle adjustment, which
     # end once the steps between frames no longer change; 0 = none
     max_width: int = Field(default=4096, ge=64)  # pixels across a panorama; wider ones are halved
 

@@ -19,13 +19,15 @@ logger = logging.getLogger(__name__)
 
 def align(state: State) -> State:
     """Align patches and adjust in rounds, until steps move by less than their noise."""
-    before = state
-    for n in range(1, state.run.settings.patches.rounds + 1):
+    before, rounds = state, state.run.settings.patches.rounds
+    for n in range(1, rounds + 1):
         if is_settled(before, state, n):
-            break
+            return state
         if n > 1:
             state = frontend.align_gyro_to_map(state, f"imu_aligned{n}")
         before, state = state, _round(state, n)
+    if rounds > 2 and not is_settled(before, state, rounds + 1):
+        logger.warning("poses still moved in the last of %d rounds of patch alignment", rounds)
     return state
 
 

@@ -35,7 +35,7 @@ PHASES = (
     r"\w*align(ed)?1(_\w+)?|stitching1|settled_aligned2",
     r"\w*align(ed)?2(_\w+)?|stitching2|settled_aligned3",
     r"\w*align(ed)?3(_\w+)?|stitching3|settled_aligned4",
-    r"\w*align(ed)?4(_\w+)?|stitching4|settled_aligned5",
+    r"\w*align(ed)?([4-9]|\d\d+)(_\w+)?|stitching([4-9]|\d\d+)|settled_aligned([5-9]|\d\d+)",
     r"imu_final|camera|reconstruction|lenses|map|export-.*",
 )
 FEATURES, CAMERA, WEAK, KNOWN, FIRST_PATCHES, LAST_PATCHES = 1, 5, 6, 7, 8, 11  # of phases

@@ -8,6 +8,7 @@ import pytest
 from gsba.bundle import readout
 from gsba.bundle.readout import CameraEstimate, CameraEstimates
 from gsba.camera.lens import Lenses
+from gsba.config import RefineSettings
 from gsba.pipeline import camera, frontend, patch_rounds
 from gsba.pipeline.state import State
 
@@ -40,6 +41,26 @@ def test_a_readout_that_the_adjustment_takes_back_is_adjusted_without(
     patch_rounds._adjust_under_lenses(state_of(false), MagicMock(), 1)
     assert stages == ["aligned1", "aligned1_instant"]
     assert tried[1].lenses.readout_motion is None and tried[1].reason == readout.VANISHED
+
+
+@pytest.mark.parametrize(
+    ("settled_after", "rounds", "told"), [(3, 3, False), (6, 6, False), (9, 8, True)]
+)
+def test_rounds_go_on_until_steps_are_settled_and_say_if_they_are_not(
+    settled_after: int,
+    rounds: int,
+    told: bool,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    done, state = [], MagicMock()
+    state.run.settings = RefineSettings()
+    monkeypatch.setattr(frontend, "align_gyro_to_map", lambda state, *_, **__: state)
+    monkeypatch.setattr(patch_rounds, "_round", lambda state, n: done.append(n) or state)
+    monkeypatch.setattr(patch_rounds, "is_settled", lambda _, __, n: n > settled_after)
+    patch_rounds.align(state)
+    assert done == list(range(1, rounds + 1))
+    assert ("still moved in the last of 8 rounds" in caplog.text) is told
 
 
 def test_a_readout_that_was_taken_back_is_not_looked_for_again(

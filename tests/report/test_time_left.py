@@ -78,6 +78,12 @@ def test_every_stage_has_a_phase() -> None:
     assert [phase_of(name) for name in STAGES] == list(range(len(PHASES)))
     assert phase_of("lenses0") == phase_of("settled_far_readout") == CAMERA
     assert phase_of("settled_aligned3") == phase_of("align2") == LAST_PATCHES - 2
+    assert (
+        phase_of("align4")
+        == phase_of("settled_aligned8")
+        == phase_of("aligned12_1")
+        == LAST_PATCHES
+    )
     assert phase_of("features@walk") == FEATURES and phase_of("again_lensed0") == CAMERA + 2
     assert phase_of("first-features") is None  # of a first solution, which the table leaves out
 
