@@ -318,11 +318,15 @@ class _Adjusted(Protocol):
     def __call__(self, view: V, so_far: Solution, some: Sequence[float]) -> tuple[Solution, V]: ...
 
 
+_FEW_CHANGES = 1e-4  # share of the observations that may enter or leave at a gate once a camera is
+# settled: a few at its edge do so in turn for ever
+
+
 def _settled(
     start: Solution, view: CameraView, gates: Sequence[float], adjusted: _Adjusted
 ) -> tuple[Solution, CameraView, Keypoints]:
-    """Solve for the camera under each gate until it takes in what it was solved with; the last
-    round is of poses and points alone, and of the rays returned.
+    """Solve for the camera under each gate until that takes in what it was solved with but for a
+    few; the last round is of poses and points alone, and of the rays returned.
 
     Few observations, of near points that both lenses see, tell how far apart the lenses are. Under
     a wrong distance the gate leaves them out, and what is left confirms it. The tightest gate
@@ -335,7 +339,8 @@ def _settled(
             solved, view = adjusted(view, solved, (gate,))
             rounds += solved.rounds
             last = solved.rounds[-1]
-            if not last.accepted or last.support == last.observations:
+            entering = abs(last.support - last.observations)
+            if not last.accepted or entering <= _FEW_CHANGES * last.observations:
                 break
     solved, rays = adjusted(FixedRays(view.keypoints), solved, gates[-1:])
     return replace(solved, rounds=rounds + solved.rounds), view, rays.keypoints

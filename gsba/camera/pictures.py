@@ -53,7 +53,10 @@ class Picture:
 
     def sample(self, directions: np.ndarray, how: int) -> np.ndarray:
         """Values (h, w[, C]) in directions (h, w, 3), by an interpolation of OpenCV."""
-        places = self.grid.places(directions).astype(np.float32)
+        return self.at(self.grid.places(directions).astype(np.float32), how)
+
+    def at(self, places: np.ndarray, how: int) -> np.ndarray:
+        """Values (h, w[, C]) at OpenCV pixels (h, w, 2) float32, by an interpolation of OpenCV."""
         border = cv2.BORDER_REPLICATE
         return cv2.remap(self.image, places[..., 0], places[..., 1], how, borderMode=border)
 

@@ -1,6 +1,7 @@
 """The camera as variables of the graph: their covariances beside the poses'."""
 
 from dataclasses import replace
+from unittest.mock import MagicMock
 
 import gtsam
 import numpy as np
@@ -15,7 +16,8 @@ from factors.direct_system import reduced_system
 from gsba import Family, MapSnapshot, X
 from gsba.bundle import adjustment
 from gsba.bundle.adjustment import values_of
-from gsba.bundle.camera_adjustment import CameraSystem, solve_with_camera
+from gsba.bundle.camera_adjustment import CameraSystem, CameraView, solve_with_camera
+from gsba.bundle.camera_adjustment import _settled as _settle_camera
 from gsba.bundle.camera_variables import CameraUnknowns
 from gsba.bundle.families import Bearings, Families
 from gsba.bundle.readout import CameraEstimate, CameraEstimates
@@ -24,7 +26,7 @@ from gsba.camera.cameras import Cameras
 from gsba.camera.lens import Lenses
 from gsba.config import CameraSettings
 from gsba.similarity import pose_similarity
-from gsba.types import GyroConstraints, Solution
+from gsba.types import GyroConstraints, Round, Solution
 
 CENTRE, BAND, READOUT_S = np.array([0.004, -0.003, 0.05]), np.deg2rad(4), 0.03
 SWEEPS = np.array([[-1.0, 0, 0], [0, 1.0, 0]])
@@ -281,3 +283,18 @@ def test_a_camera_s_unknowns_do_not_act_on_what_others_see() -> None:
     np.testing.assert_allclose(
         by_frame[plain][:, :, :6], turned[plain], atol=1e-6 * np.abs(turned).max()
     )
+
+
+def test_a_camera_is_settled_once_few_observations_enter_or_leave() -> None:
+    """Two at a gate's edge may take turns for ever."""
+    counts = [(40_000, 39_900), (39_900, 39_905), (39_905, 39_907), (39_907, 39_905)]
+    start, gates = Solution.without_points(np.stack([np.eye(4)])), []
+
+    def adjusted(view: CameraView, _: Solution, some: tuple[float]) -> tuple[Solution, CameraView]:
+        observations, support = counts[len(gates)] if some == (6.0,) else (30_000, 30_000)
+        gates.extend(some)
+        done = Round(some[0], 1.0, observations, 9_000, support, True, (), "")
+        return replace(start, rounds=(done,)), view
+
+    _settle_camera(start, MagicMock(), (6.0, 3.0), adjusted)
+    assert gates == [6.0, 6.0, 6.0, 3.0]

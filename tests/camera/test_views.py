@@ -10,12 +10,13 @@ from pixels import pixel_centres
 from scipy.spatial.transform import Rotation
 
 from gsba.camera.lens import Lenses
-from gsba.camera.pictures import panorama
+from gsba.camera.pictures import Picture, lens_picture, panorama
 from gsba.camera.sphere import erp_directions, erp_from_bearings
 from gsba.camera.views import View, ViewCutter, lens_views
 from gsba.demo.render import render_erp
 from gsba.demo.walk import walk_poses
 from gsba.geometry import pose
+from gsba.types import Fisheye
 
 WIDTH, SIZE = 1024, 160
 SHAPE = WIDTH, WIDTH // 2
@@ -72,3 +73,18 @@ def test_a_view_is_what_its_lens_sees(name: str) -> None:
         float(np.abs(_blurred(found) - _blurred(other)).mean()) for other in (exact, central)
     )
     assert off < 1.0 and elsewhere > 4 * off  # of 255: interpolation aside, the same
+
+
+def test_views_of_raw_lenses_are_cut_where_their_rays_lie(monkeypatch: pytest.MonkeyPatch) -> None:
+    lens = Fisheye(1500, 1500, 480.0, (748.0, 753.0), (-0.05, 0.006, -0.005, 0.001), (0.0, 0, 0))
+    view, found = lens_views(TURNED, 801)[1], []
+
+    def at(picture: Picture, places: np.ndarray, _: int) -> np.ndarray:
+        found.append(places)
+        return picture.image[: len(places), : places.shape[1]]
+
+    monkeypatch.setattr(Picture, "at", at)
+    picture = lens_picture(lens, np.zeros((1500, 1500), np.uint8), view.focal)
+    list(ViewCutter((view,), Lenses(), 0).cut([picture]))
+    exact = picture.grid.places(view.rays(pixel_centres(view.width, view.height)))
+    np.testing.assert_allclose(np.concatenate(found), exact, atol=0.005)  # pixels
