@@ -25,6 +25,7 @@ from gsba.types import (
 from gsba.types.records import AT_ONCE
 
 MIN_OBSERVATIONS = 12  # of a refined frame: 24 residuals for the 6 unknowns of its pose
+_MIN_PLACED = 3  # frames of a stretch that places a map: two always correlate
 _MIN_CORRELATION = 0.1  # least correlation of refined and coarse positions: with usual drift it is
 # .8
 
@@ -39,6 +40,7 @@ def assemble(
     components: np.ndarray | None = None,
     joint_errors: JointErrors | None = None,
     scratch: Path | None = None,
+    false_steps: np.ndarray | None = None,
 ) -> Reconstruction:
     """Carry the solution back to the trajectory's world and gather what exports need.
 
@@ -52,6 +54,8 @@ def assemble(
         joint_errors: of the poses; None = not known.
         scratch: folder on the disk that takes arrays of all observations; None = they are in
             memory.
+        false_steps: (F - 1,) bool, coarse steps that images contradict. Where the frames of a map
+            do not lie as their coarse poses, its longest stretch without such a step places it.
 
     Raises:
         GsbaError: not where the trajectory has its frames, or residuals that no solution leaves.
@@ -63,7 +67,8 @@ def assemble(
     if coarse is not None:
         known, targets = known & (coarse.sources == PoseSource.SLAM), coarse.world_T_rigs
     groups = numbered(components, len(seen))
-    placed, points_world, stretch = _placed(adjustment, targets, known, groups)
+    false = np.zeros(max(len(seen) - 1, 0), bool) if false_steps is None else false_steps
+    placed, points_world, stretch = _placed(adjustment, targets, known, groups, false)
     scales = stretch[np.unique(groups, return_index=True)[1], 3]  # of each map
     points = landmarks.tracks.points
     lengths = np.maximum(np.bincount(points, minlength=len(landmarks.points_world)), 1)
@@ -129,23 +134,31 @@ def world_scale(solved: Solution, result: Reconstruction) -> float:
 
 
 def _placed(
-    adjustment: Solution, target_T_rigs: np.ndarray | None, known: np.ndarray, groups: np.ndarray
+    adjustment: Solution,
+    target_T_rigs: np.ndarray | None,
+    known: np.ndarray,
+    groups: np.ndarray,
+    false_steps: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Poses, points, and factors (F, 6) of standard deviations, each map in its own world.
 
-    Frames `known` (F,) say where their map goes; all do, where fewer than two are. Of `groups` (F,)
-    a map but the largest that does not lie as its coarse poses, at no scale, stays as solved.
+    Frames `known` (F,) say where their map goes; all do, where fewer than two are. If these do not
+    lie as their coarse poses, at no scale, those of the longest stretch without `false_steps`
+    (F - 1,) do: tracking that was lost may go on in another world. Of `groups` (F,) a map but the
+    largest that does not lie as its stretch either stays as solved.
     """
     poses, landmarks = adjustment.world_T_rigs, adjustment.landmarks
     placed, stretch = np.empty_like(poses), np.ones((len(poses), 6))
     points, hosts = np.empty_like(landmarks.points_world), landmarks.tracks.hosts()
+    stretches = np.concatenate([[0], np.cumsum(false_steps)])
     if target_T_rigs is None:
         return poses, landmarks.points_world, stretch
     for group in np.unique(groups):
         inside = groups == group
         chosen = known & inside if np.count_nonzero(known & inside) > 1 else inside
+        longest = chosen & (stretches == np.bincount(stretches[chosen]).argmax())
         try:
-            move = pose_similarity(poses[chosen], target_T_rigs[chosen], _MIN_CORRELATION)
+            move = _move(poses, target_T_rigs, chosen, longest)
         except NoSimilarityError as error:
             if group == 0:
                 raise GsbaError(
@@ -159,3 +172,16 @@ def _placed(
         there = inside[hosts]
         points[there] = move.points(landmarks.points_world[there])
     return placed, points, stretch
+
+
+def _move(
+    poses: np.ndarray, target_T_rigs: np.ndarray, chosen: np.ndarray, fewer: np.ndarray
+) -> Sim3:
+    """Similarity of poses (F, 4, 4) to their targets by the frames `chosen` (F,) bool, or by
+    `fewer` of them if these do not lie as their targets. NoSimilarityError if neither do."""
+    try:
+        return pose_similarity(poses[chosen], target_T_rigs[chosen], _MIN_CORRELATION)
+    except NoSimilarityError:
+        if not _MIN_PLACED <= np.count_nonzero(fewer) < np.count_nonzero(chosen):
+            raise
+        return pose_similarity(poses[fewer], target_T_rigs[fewer], _MIN_CORRELATION)

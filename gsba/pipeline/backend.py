@@ -295,6 +295,7 @@ def reconstruct(
             prior.parts,
             joint,
             run.store.scratch_folder,
+            prior.trust.false_steps,
         )
         result = replace(
             result,

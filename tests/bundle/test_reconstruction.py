@@ -54,6 +54,7 @@ def _assemble(
     sources: np.ndarray | None = None,
     covariances: np.ndarray | None = None,
     joint: JointErrors | None = None,
+    false_steps: np.ndarray | None = None,
 ) -> Reconstruction:
     num = len(world.world_T_rigs)
     poses = CoarsePoses(
@@ -63,7 +64,7 @@ def _assemble(
     )
     covariances = np.zeros((num, 6, 6)) if covariances is None else covariances
     given = _adjustment(world), covariances, world.keypoints, poses, 12
-    return assemble(*given, joint_errors=joint)
+    return assemble(*given, joint_errors=joint, false_steps=false_steps)
 
 
 def test_the_result_sits_in_the_slam_world_and_scale(world: World) -> None:
@@ -152,6 +153,20 @@ def test_an_inverted_world_is_refused(world: World) -> None:
     refused(r"10 frames that could place the result .* --fps", _assemble, world, coarse, sources)
     coarse[:, :3, 3] = coarse[0, :3, 3]
     refused("no positive scale", _assemble, world, coarse)
+
+
+def test_the_longest_true_stretch_places_a_map_whose_trajectory_went_on_elsewhere(
+    world: World,
+) -> None:
+    """Tracking was lost behind frame 5 and went on in a world of its own, where all goes back."""
+    coarse, false_steps = _in_slam(world.world_T_rigs), np.zeros(9, bool)
+    coarse[6:, :3, 3] = coarse[6, :3, 3] - 20 * (coarse[6:, :3, 3] - coarse[6, :3, 3])
+    refused("10 frames that could place", _assemble, world, coarse, false_steps=false_steps)
+    false_steps[5] = True
+    found = _assemble(world, coarse, false_steps=false_steps)
+    np.testing.assert_allclose(found.world_T_rigs, _in_slam(world.world_T_rigs), atol=1e-12)
+    false_steps[:] = True  # one frame correlates with anything
+    refused("10 frames that could place", _assemble, world, coarse, false_steps=false_steps)
 
 
 def test_residuals_that_cannot_be_right_are_refused(world: World) -> None:
