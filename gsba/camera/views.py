@@ -21,9 +21,7 @@ from gsba.types import FACES, PictureFormat, Reconstruction
 FAR_DEPTH = 1e9  # map units: depth from which both lenses see alike
 _NODES_ACROSS_FACE = 33  # nodes across a face of the interpolated offsets, which vary over tens of
 # degrees
-_STEP = (
-    2  # pixels between computed directions of a view; between them they are linear to .003 pixels
-)
+_STEP = 2  # pixels between computed directions of a view, linear between to .003 pixels
 _BAND_ROWS = 256  # of a view that are computed at once
 
 
