@@ -5,7 +5,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import typer
 
@@ -205,6 +205,8 @@ def evaluate(
 
     With --splat it compares poses by the splats that are trained on them.
     """
+    from gsba.disk import write_json, write_text
+
     if splat:
         settings = splat_settings(iterations, face_size, backend, max_gaussians)
         evaluate_splat(estimate, against or [], settings, lpips or [])
@@ -216,16 +218,18 @@ def evaluate(
     if depth is not None and truth is None:
         raise GsbaError("--depth measures errors of poses: give --truth FILE as well")
     known = {name: str(x) for name, x in (("pairs", pairs), ("gps", gps), ("up", up)) if x}
+    content = dict[str, Any]()
     if scan is not None:
-        _against_scan(estimate, scan, known, json_file if truth is None else None)
+        content = _against_scan(estimate, scan, known)
     elif known:
         raise GsbaError("--pairs, --gps and --up start the alignment to a scan: give --scan FILE")
     if truth is None:
         if not splat and scan is None:
             raise GsbaError("nothing to compare with: give --truth FILE, --scan FILE, or --splat")
+        if json_file is not None and content:
+            write_json(json_file, content)
         return
     # Compare a run or a trajectory with a true one: pose errors and induced pixel errors.
-    from gsba.disk import write_text
     from gsba.evaluate.pixels import depth_maps, induced_errors
     from gsba.evaluate.trajectory import evaluate as compare
     from gsba.evaluate.trajectory import format_table
@@ -246,10 +250,10 @@ def evaluate(
     if estimate.is_dir():
         claims, judged = _consistency(estimate, true)
     if json_file is not None:
-        content = errors.to_json() | ({"induced": asdict(induced)} if induced else {})
+        content = errors.to_json() | ({"scan": content} if content else {})
+        content |= {"induced": asdict(induced)} if induced else {}
         content |= {"consistency": claims.to_json()} if claims else {}
-        text = json.dumps(content, indent=1) + "\n"
-        write_text(json_file, text)
+        write_text(json_file, json.dumps(content, indent=1) + "\n")
     typer.echo(format_table({estimate.name: errors}))
     if fault := fault_of_truth(found, true):
         logger.warning("--truth %s: %s", truth, fault)
@@ -262,8 +266,9 @@ def evaluate(
         typer.echo(judged)
 
 
-def _against_scan(run: Path, path: Path, known: dict[str, str], json_file: Path | None) -> None:
-    """Measure a run's points against a scan: a table, RUN/scan.json, a coloured RUN/scan.ply."""
+def _against_scan(run: Path, path: Path, known: dict[str, str]) -> dict[str, Any]:
+    """Measure a run's points against a scan: a table, RUN/scan.json, a coloured RUN/scan.ply. What
+    is measured, as plain values."""
     from gsba.config_file import validated
     from gsba.disk import write_json
     from gsba.evaluate.scans import format_scan, scan_errors
@@ -288,8 +293,6 @@ def _against_scan(run: Path, path: Path, known: dict[str, str], json_file: Path 
     with in_file(path):
         errors = scan_errors(reconstruction, surfaces, coarse, guess)
     content = {"scan": str(path), "offset": surfaces.offset.tolist(), **errors.to_json()}
-    if json_file is not None:
-        write_json(json_file, content)
     points = {"of": len(reconstruction.points_world), "furthest": errors.furthest}
     points |= {"rows": errors.rows.tolist(), "distances": errors.after.values.round(6).tolist()}
     write_json(run / "scan.json", content | {"points": points})
@@ -297,6 +300,7 @@ def _against_scan(run: Path, path: Path, known: dict[str, str], json_file: Path 
     write_splat_points(run / "scan.ply", errors.cloud, errors.colors())
     typer.echo(format_scan(errors))
     typer.echo(f"{run / 'scan.json'} holds the histograms, {run / 'scan.ply'} the coloured cloud.")
+    return content
 
 
 def _consistency(run: Path, truth: "Trajectory") -> "tuple[Consistency | None, str]":

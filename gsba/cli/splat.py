@@ -67,10 +67,12 @@ def render(
     reconstruction, frames = load_run(run)
     if frame not in frames.names:
         raise GsbaError(f"{run} has no frame {frame!r}: its first is {frames.names[0]!r}")
+    f, folder = frames.names.index(frame), out or run / "renderings"
+    if folder.resolve() in {path.resolve().parent for path in frames.paths[f]}:
+        raise GsbaError(f"--out {out} is the folder of the frames: choose another for renderings")
     gaussians, renderer = read_ply(splat), choose_backend(settings.backend)
     near = near_of(reconstruction.world_T_rigs)
     optics = Optics.of(load_cameras(run, reconstruction, frames), reconstruction)
-    f, folder = frames.names.index(frame), out or run / "renderings"
     pose, views = reconstruction.world_T_rigs[f], optics.views(settings.face_size)
     (rig,) = optics.own(pose[None], np.array([f]))
     faces = render_views(gaussians, rig, views, near, renderer)

@@ -71,8 +71,14 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
     """Write `timestamp tx ty tz qx qy qz qw` lines that `read_trajectory` takes back.
 
     Timestamps survive exactly, values to 15 digits. The file appears whole or not at all.
+    GsbaError: it cannot be written, or a pose is not finite or holds no rotation.
     """
-    path = Path(path)
+    path, poses = Path(path), trajectory.world_T_rigs
+    finite = np.isfinite(poses).all(axis=(1, 2)) & np.isfinite(trajectory.timestamps)
+    right = finite & _nearest_rotations(np.where(finite[:, None, None], poses, 0)[:, :3, :3])[1]
+    if not right.all():
+        what = "its rotation is none" if finite[right.argmin()] else "it is not finite"
+        raise GsbaError(f"{path}: pose {right.argmin()} cannot be written: {what}")
     wxyz = quaternion_from_rotation(trajectory.world_T_rigs[:, :3, :3])
     values = np.hstack([trajectory.world_T_rigs[:, :3, 3], wxyz[:, [1, 2, 3, 0]]])
     lines = [
@@ -143,13 +149,18 @@ def _read_kitti(path: Path, rows: Sequence[tuple[int, str]], timestamps: Path | 
     tracked = _tracked(path, values, world_P_rigs[:, :, 3], turned, where)
     where, times = [where[i] for i in tracked], times[tracked]
     world_P_rigs = world_P_rigs[tracked]
-    u, _, vt = np.linalg.svd(world_P_rigs[:, :, :3])
-    nearest = u @ vt
-    off = np.abs(nearest - world_P_rigs[:, :, :3]).max(axis=(1, 2))
-    bad = np.flatnonzero((off > _UNIT_TOLERANCE) | (np.linalg.det(nearest) < 0))
-    if len(bad):
-        raise GsbaError(f"{where[bad[0]]}: the left 3x3 block is not a rotation")
+    nearest, is_one = _nearest_rotations(world_P_rigs[:, :, :3])
+    if not is_one.all():
+        raise GsbaError(f"{where[is_one.argmin()]}: the left 3x3 block is not a rotation")
     return _trajectory(path, times, pose(nearest, world_P_rigs[:, :, 3]), where)
+
+
+def _nearest_rotations(matrices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The rotations (N, 3, 3) nearest to finite matrices (N, 3, 3), and if they are these (N,)."""
+    u, _, vt = np.linalg.svd(matrices)
+    nearest = u @ vt
+    off = np.abs(nearest - matrices).max(axis=(1, 2))
+    return nearest, (off <= _UNIT_TOLERANCE) & (np.linalg.det(nearest) > 0)
 
 
 def _read_stella_map(path: Path) -> Trajectory:

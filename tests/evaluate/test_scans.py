@@ -1,6 +1,7 @@
 """A run measured on a scan: near where its points are, far where they were before."""
 
 import dataclasses
+import json
 from functools import partial
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from plain_records import frames_of, map_of
 from scan_world import HALL, INTO_SCAN, SIZE, cloud, scan
 from synthetic import unit
 
+from gsba.cli import results
 from gsba.config import PlacementSettings
 from gsba.evaluate import scans
 from gsba.evaluate.scans import format_scan, scan_errors
@@ -17,7 +19,8 @@ from gsba.geometry import pose
 from gsba.placement import guess_in_scan
 from gsba.scans.search import Guess
 from gsba.scans.types import Scan
-from gsba.types import PictureFormat, Reconstruction
+from gsba.trajectory.files import write_tum
+from gsba.types import PictureFormat, Reconstruction, Trajectory
 
 
 def _run() -> Reconstruction:
@@ -78,3 +81,17 @@ def test_pairs_tell_where_to_look(tmp_path: Path) -> None:
     np.testing.assert_allclose(guess.similarity.translation, moved, atol=1e-9)
     nothing, _ = guess_in_scan(run, frames, PlacementSettings(scan="scan.ply"), far)
     assert nothing == Guess()
+
+
+def test_a_scan_and_a_truth_are_both_in_the_json(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    measured = {"scan": "hall.ply", "after": {"median": 0.004}}
+    monkeypatch.setattr(results, "_against_scan", lambda *_: measured)
+    write_tum(tmp_path / "a.tum", Trajectory(np.arange(12.0), _run().world_T_rigs))
+    given = {"scan": Path("hall.ply"), "json_file": tmp_path / "errors.json"}
+    results.evaluate(tmp_path / "a.tum", tmp_path / "a.tum", **given)
+    both = json.loads((tmp_path / "errors.json").read_text())
+    assert both["scan"] == measured and both["ate"]["rmse"] < 1e-9
+    results.evaluate(tmp_path / "a.tum", **given)
+    assert json.loads((tmp_path / "errors.json").read_text()) == measured

@@ -59,6 +59,8 @@ def test_render_writes_faces_and_a_panorama(run: Path) -> None:
     assert shapes[f"{frame}_erp.png"] == (64, 128, 3)
     assert shapes[f"{frame}_down.png"] == (32, 32, 3) and len(shapes) == 7
     fails(run_gsba("render", ply, run, "--frame", "nonsense"), "no frame 'nonsense'")
+    beside = ("--frame", frame, "--out", load_run(run)[1].paths[2][0].parent)
+    fails(run_gsba("render", ply, run, *beside), "is the folder of the frames: choose another")
 
 
 def test_evaluate_compares_sources_and_resumes(case: Case, run: Path, tmp_path: Path) -> None:

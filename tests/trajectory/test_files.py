@@ -246,6 +246,16 @@ def test_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
     refused("cannot be written", write_tum, tmp_path / "no" / "a.tum", good)
 
 
+def test_poses_that_are_none_are_not_written(tmp_path: Path) -> None:
+    path, poses = saved(tmp_path, "old", "a.tum"), np.stack([np.eye(4)] * 2)
+    times, mirrored = np.array([0.0, 1.0]), poses.copy()
+    mirrored[1, 0, 0] = -1
+    refused("pose 1 cannot be written: its rotation", write_tum, path, Trajectory(times, mirrored))
+    poses[1, 0, 3] = np.nan
+    refused("pose 1 cannot be written: it is not", write_tum, path, Trajectory(times, poses))
+    assert path.read_text() == "old"
+
+
 @needs_shared
 def test_real_map_agrees_with_its_keyframe_file() -> None:
     from_map = read_trajectory(SHARED / "apartment" / "map.msg")
