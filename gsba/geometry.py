@@ -99,10 +99,19 @@ def angular_errors(
     return np.arctan2(across, np.einsum("oi,oi->o", rays, offsets))
 
 
-def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
-    """Rotation (3, 3) nearest to a matrix (3, 3) in the sense of Umeyama, PAMI 13(4), 1991."""
-    u, _, vt = np.linalg.svd(matrix)
-    return u @ np.diag([1, 1, np.sign(np.linalg.det(u) * np.linalg.det(vt))]) @ vt
+def nearest_rotation(matrices: np.ndarray) -> np.ndarray:
+    """Rotations (..., 3, 3) nearest to matrices (..., 3, 3) in the sense of Umeyama, PAMI 13(4),
+    1991."""
+    u, _, vt = np.linalg.svd(matrices)
+    u[..., 2] *= np.sign(np.linalg.det(u) * np.linalg.det(vt))[..., None]
+    return u @ vt
+
+
+def as_rotations(matrices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The rotations nearest to finite matrices (..., 3, 3), and bool (...,): False where a matrix
+    is none, by more than a thousandth in an entry."""
+    nearest = nearest_rotation(matrices)
+    return nearest, np.abs(nearest - matrices).max(axis=(-2, -1)) <= 1e-3
 
 
 def median_direction(directions: np.ndarray) -> np.ndarray:

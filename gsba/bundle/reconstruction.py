@@ -150,9 +150,9 @@ def _placed(
     poses, landmarks = adjustment.world_T_rigs, adjustment.landmarks
     placed, stretch = np.empty_like(poses), np.ones((len(poses), 6))
     points, hosts = np.empty_like(landmarks.points_world), landmarks.tracks.hosts()
-    stretches = np.concatenate([[0], np.cumsum(false_steps)])
     if target_T_rigs is None:
         return poses, landmarks.points_world, stretch
+    stretches = np.concatenate([[0], np.cumsum(false_steps)])
     for group in np.unique(groups):
         inside = groups == group
         chosen = known & inside if np.count_nonzero(known & inside) > 1 else inside

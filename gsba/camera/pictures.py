@@ -53,11 +53,11 @@ class Picture:
 
     def sample(self, directions: np.ndarray, how: int) -> np.ndarray:
         """Values (h, w[, C]) in directions (h, w, 3), by an interpolation of OpenCV."""
-        return self.at(self.grid.places(directions).astype(np.float32), how)
+        return self.at(self.grid.places(directions), how)
 
     def at(self, places: np.ndarray, how: int) -> np.ndarray:
-        """Values (h, w[, C]) at OpenCV pixels (h, w, 2) float32, by an interpolation of OpenCV."""
-        border = cv2.BORDER_REPLICATE
+        """Values (h, w[, C]) at OpenCV pixels (h, w, 2), by an interpolation of OpenCV."""
+        places, border = places.astype(np.float32, copy=False), cv2.BORDER_REPLICATE
         return cv2.remap(self.image, places[..., 0], places[..., 1], how, borderMode=border)
 
 

@@ -21,10 +21,15 @@ def bearings_from_erp(pixels: np.ndarray, width: int, height: int) -> np.ndarray
     return np.stack([c * np.sin(longitude), -np.sin(latitude), c * np.cos(longitude)], axis=-1)
 
 
+def row_bands(height: int) -> Iterator[slice]:
+    """Yield the bands of a picture's rows."""
+    for top in range(0, height, _BAND_ROWS):
+        yield slice(top, min(top + _BAND_ROWS, height))
+
+
 def pixel_bands(columns: np.ndarray, height: int) -> Iterator[tuple[slice, np.ndarray]]:
     """Yield rows and centres (h, C, 2) of the pixels of bands of a picture's columns (C,)."""
-    for top in range(0, height, _BAND_ROWS):
-        rows = slice(top, min(top + _BAND_ROWS, height))
+    for rows in row_bands(height):
         centres = np.meshgrid(columns + 0.5, np.arange(rows.start, rows.stop) + 0.5)
         yield rows, np.stack(centres, axis=-1)
 

@@ -14,6 +14,7 @@ from gsba.camera.cameras import Cameras
 from gsba.camera.lens import Lenses
 from gsba.camera.pictures import LensGrid, Picture, panorama
 from gsba.camera.rig import RIG_R_FACE, CubeRig
+from gsba.camera.sphere import row_bands
 from gsba.geometry import pose, unit
 from gsba.log import GsbaError
 from gsba.types import FACES, PictureFormat, Reconstruction
@@ -22,7 +23,6 @@ FAR_DEPTH = 1e9  # map units: depth from which both lenses see alike
 _NODES_ACROSS_FACE = 33  # nodes across a face of the interpolated offsets, which vary over tens of
 # degrees
 _STEP = 2  # pixels between computed directions of a view, linear between to .003 pixels
-_BAND_ROWS = 256  # of a view that are computed at once
 
 
 @dataclass(frozen=True, slots=True)
@@ -293,26 +293,36 @@ class ViewCutter:
     def _view(self, view: View, offsets: np.ndarray, picture: Picture, how: int) -> np.ndarray:
         """A view (height, width[, C]) of a picture."""
         image, grid = picture.image, picture.grid
-        smooth = isinstance(grid, LensGrid)  # places are linear between nodes, as directions are
         out = np.empty((view.height, view.width, *image.shape[2:]), image.dtype)
-        across = _STEP * (np.arange(-(-view.width // _STEP) + 2) - 0.5)  # one beyond either side
-        for top in range(0, view.height, _BAND_ROWS):
-            rows = slice(top, min(top + _BAND_ROWS, view.height))
-            down = top + _STEP * (np.arange(-(-(rows.stop - top) // _STEP) + 2) - 0.5)
-            pixels = np.stack(np.meshgrid(across, down), axis=-1)
+        for rows in row_bands(view.height):
+            height = rows.stop - rows.start
+            down = rows.start + _nodes_along(height)
+            pixels = np.stack(np.meshgrid(_nodes_along(view.width), down), axis=-1)
             nodes = pixels * ((_NODES_ACROSS_FACE - 1) / np.array([view.width, view.height]))
             nodes = nodes.astype(np.float32)
             moved = cv2.remap(
                 offsets, nodes[..., 0], nodes[..., 1], cv2.INTER_CUBIC,
                 borderMode=cv2.BORDER_REPLICATE,
             )  # fmt: skip
-            known = view.rays(pixels) @ self._turn.T + moved
-            known = (grid.places(known) if smooth else known).astype(np.float32)
-            known = cv2.resize(known, None, fx=_STEP, fy=_STEP, interpolation=cv2.INTER_LINEAR)
-            known = known[_STEP:, _STEP : _STEP + view.width][: rows.stop - top]
-            sampled = picture.at(known, how) if smooth else picture.sample(known, how)
-            out[rows] = sampled.reshape(out[rows].shape)
+            rays, size = view.rays(pixels) @ self._turn.T + moved, (height, view.width)
+            if isinstance(grid, LensGrid):  # its places have no seam and no pole
+                places = _between_nodes(grid.places(rays), size)
+            else:
+                places = grid.places(_between_nodes(rays, size))
+            out[rows] = picture.at(places, how).reshape(out[rows].shape)
         return out
+
+
+def _nodes_along(pixels: int) -> np.ndarray:
+    """Places, in pixels, of the nodes along a side of a view, one of them beyond either end."""
+    return _STEP * (np.arange(-(-pixels // _STEP) + 2) - 0.5)
+
+
+def _between_nodes(values: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Values (h, w, C) float32 at all pixels of a size (h, w), linear between those at nodes."""
+    known = values.astype(np.float32)
+    known = cv2.resize(known, None, fx=_STEP, fy=_STEP, interpolation=cv2.INTER_LINEAR)
+    return known[_STEP : _STEP + size[0], _STEP : _STEP + size[1]]
 
 
 def nearest_lens(view: View, centres: np.ndarray) -> int:

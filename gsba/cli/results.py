@@ -218,16 +218,16 @@ def evaluate(
     if depth is not None and truth is None:
         raise GsbaError("--depth measures errors of poses: give --truth FILE as well")
     known = {name: str(x) for name, x in (("pairs", pairs), ("gps", gps), ("up", up)) if x}
-    content = dict[str, Any]()
+    on_scan = dict[str, Any]()
     if scan is not None:
-        content = _against_scan(estimate, scan, known)
+        on_scan = _against_scan(estimate, scan, known)
     elif known:
         raise GsbaError("--pairs, --gps and --up start the alignment to a scan: give --scan FILE")
     if truth is None:
         if not splat and scan is None:
             raise GsbaError("nothing to compare with: give --truth FILE, --scan FILE, or --splat")
-        if json_file is not None and content:
-            write_json(json_file, content)
+        if json_file is not None and on_scan:
+            write_json(json_file, on_scan)
         return
     # Compare a run or a trajectory with a true one: pose errors and induced pixel errors.
     from gsba.evaluate.pixels import depth_maps, induced_errors
@@ -250,7 +250,7 @@ def evaluate(
     if estimate.is_dir():
         claims, judged = _consistency(estimate, true)
     if json_file is not None:
-        content = errors.to_json() | ({"scan": content} if content else {})
+        content = errors.to_json() | ({"scan": on_scan} if on_scan else {})
         content |= {"induced": asdict(induced)} if induced else {}
         content |= {"consistency": claims.to_json()} if claims else {}
         write_text(json_file, json.dumps(content, indent=1) + "\n")

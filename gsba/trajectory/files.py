@@ -10,7 +10,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gsba.frames.times import read_lines, read_times, seconds
-from gsba.geometry import inverse, pose, quaternion_from_rotation, rotation_from_quaternion
+from gsba.geometry import (
+    as_rotations,
+    inverse,
+    pose,
+    quaternion_from_rotation,
+    rotation_from_quaternion,
+)
 from gsba.log import GsbaError, brief
 from gsba.types import Trajectory
 
@@ -20,7 +26,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 MAX_COORDINATE = 1e12  # largest coordinate, in any unit: beyond, differences lose precision
-_UNIT_TOLERANCE = 1e-3  # largest deviation of a quaternion's norm, or of a matrix from a rotation
+_UNIT_TOLERANCE = 1e-3  # largest deviation of a quaternion's norm from one
 
 
 def read_trajectory(path: Path, timestamps: Path | None = None) -> Trajectory:
@@ -75,7 +81,7 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
     """
     path, poses = Path(path), trajectory.world_T_rigs
     finite = np.isfinite(poses).all(axis=(1, 2)) & np.isfinite(trajectory.timestamps)
-    right = finite & _nearest_rotations(np.where(finite[:, None, None], poses, 0)[:, :3, :3])[1]
+    right = finite & as_rotations(np.where(finite[:, None, None], poses, 0)[:, :3, :3])[1]
     if not right.all():
         what = "its rotation is none" if finite[right.argmin()] else "it is not finite"
         raise GsbaError(f"{path}: pose {right.argmin()} cannot be written: {what}")
@@ -149,18 +155,10 @@ def _read_kitti(path: Path, rows: Sequence[tuple[int, str]], timestamps: Path | 
     tracked = _tracked(path, values, world_P_rigs[:, :, 3], turned, where)
     where, times = [where[i] for i in tracked], times[tracked]
     world_P_rigs = world_P_rigs[tracked]
-    nearest, is_one = _nearest_rotations(world_P_rigs[:, :, :3])
+    nearest, is_one = as_rotations(world_P_rigs[:, :, :3])
     if not is_one.all():
         raise GsbaError(f"{where[is_one.argmin()]}: the left 3x3 block is not a rotation")
     return _trajectory(path, times, pose(nearest, world_P_rigs[:, :, 3]), where)
-
-
-def _nearest_rotations(matrices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The rotations (N, 3, 3) nearest to finite matrices (N, 3, 3), and if they are these (N,)."""
-    u, _, vt = np.linalg.svd(matrices)
-    nearest = u @ vt
-    off = np.abs(nearest - matrices).max(axis=(1, 2))
-    return nearest, (off <= _UNIT_TOLERANCE) & (np.linalg.det(nearest) > 0)
 
 
 def _read_stella_map(path: Path) -> Trajectory:

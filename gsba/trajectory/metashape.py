@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from gsba.frames.times import stem_of
-from gsba.geometry import pose
+from gsba.geometry import as_rotations, pose
 from gsba.log import GsbaError, brief
 from gsba.types import FrameSet, Trajectory
 
@@ -91,10 +91,8 @@ def read_metashape(path: Path) -> list[NamedPoses]:
             raise GsbaError(f"{where}: its transform is not 16 numbers") from None
         if not np.isfinite(matrix).all():
             raise GsbaError(f"{where}: its transform is not finite")
-        u, _, vt = np.linalg.svd(matrix[:3, :3])
-        rotation = u @ vt
-        off = np.abs(rotation - matrix[:3, :3]).max()
-        if off > 1e-3 or np.linalg.det(rotation) < 0:
+        rotation, is_one = as_rotations(matrix[:3, :3])
+        if not is_one:
             raise GsbaError(f"{where}: the left 3x3 block of its transform is not a rotation")
         of_component[name] = pose(rotation, matrix[:3, 3])
     if not found:
