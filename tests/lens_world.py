@@ -25,10 +25,13 @@ INTERVAL_S = 0.5
 
 
 def seen_through(
-    lenses: Lenses | Cameras, seed: int = 0, world_T_rigs: np.ndarray | None = None
+    lenses: Lenses | Cameras,
+    seed: int = 0,
+    world_T_rigs: np.ndarray | None = None,
+    num_frames: int = 24,
 ) -> tuple[World, Keypoints]:
     """A world, and its keypoints as these lenses have them, from poses of its own or these."""
-    world = make_world(seed, 24, 1200, SIGMA, false_share=0.02)
+    world = make_world(seed, num_frames, 1200, SIGMA, false_share=0.02)
     if world_T_rigs is not None:
         world = replace(world, world_T_rigs=world_T_rigs)
     rng, tracks = np.random.default_rng(seed + 1), world.tracks

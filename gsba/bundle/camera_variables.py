@@ -252,7 +252,7 @@ def _lens_variables(
             _add(values, graph, key, part, spread)
     if lenses.readout_motion is not None:
         given["readout"] = D(number)
-        said = settings.readout()
+        said = settings.readout() or (readout.LIKELY if camera.of_few_frames else None)
         values.insert(D(number), np.array([camera.readout_s]))
         if said is not None:
             model = gtsam.noiseModel.Isotropic.Sigma(1, said[1])

@@ -13,11 +13,15 @@ from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.shared_parameters import (
     PARTS,
     ObservedRays,
+    Weighted,
     cross_validate,
+    frame_models,
+    frame_step,
     models_of,
     newton_step,
     predicts,
     summed,
+    validated,
 )
 from gsba.camera.cameras import Cameras
 from gsba.camera.lens import Lenses, rows_run
@@ -27,7 +31,9 @@ from gsba.types import Counts, GyroConstraints, Tracks
 logger = logging.getLogger(__name__)
 
 _MIN_SIGMAS = 4.0  # least duration that is taken, in its standard deviations
+LIKELY = 0.016, 0.008  # s, readout time of a video's frame, and its standard deviation
 VANISHED = "it vanishes where each frame's own motion is adjusted beside it"
+TWO_INSTANTS = "the lenses may as well have taken their pictures at two instants"
 _AXES = np.eye(3)[:2]
 
 
@@ -45,6 +51,8 @@ class CameraEstimate:
     reason: str = ""  # why no readout was taken; empty if one was
     by_gyro: bool | None = None  # whether rotations are held to a gyro's; None = there is none
     counts: Counts = field(default_factory=lambda: Counts(0, 0, "observations"))
+    of_few_frames: bool = False  # whether it was found by each frame's own motion: the readout time
+    # is about a likely one
 
     def scaled(self, scale: float) -> "CameraEstimate":
         """The estimate in another unit of length: one map unit is `scale` of the new ones."""
@@ -53,10 +61,11 @@ class CameraEstimate:
         return replace(self, lenses=self.lenses.scaled(scale), own_sigmas=own)
 
 
-def estimate(rays: ObservedRays) -> CameraEstimate:
+def estimate(rays: ObservedRays, few_frames: bool = False) -> CameraEstimate:
     """Find how long the readout takes and which way rows are read, frames moving by velocity; no
     readout is taken while another way of reading rows predicts unseen parts nearly as well. Lenses
-    are read at one instant so far; directions in the pictures tell rows."""
+    are read at one instant so far; directions in the pictures tell rows. few_frames: judge frames
+    too few for parts of the sequence by each frame's own motion."""
     solved, keypoints, shown, lenses = rays.solved, rays.keypoints, rays.shown, rays.lenses
     landmarks, context = solved.landmarks, rays.context
     turning = turning_of(lenses, context)
@@ -79,6 +88,8 @@ def estimate(rays: ObservedRays) -> CameraEstimate:
         return moved[:, :, None] * times[:, None, :]
 
     systems, counts = models_of(rays, by_duration)
+    if not systems and few_frames:
+        return _of_few_frames(rays, ways, motion, counts)
     if not systems:
         return CameraEstimate(lenses, reason="too few points to tell rows apart", counts=counts)
     of_ways = [[part.of(slice(way, way + 1)) for part in systems] for way in range(len(ways))]
@@ -106,14 +117,54 @@ def estimate(rays: ObservedRays) -> CameraEstimate:
     )
 
 
+def _of_few_frames(
+    rays: ObservedRays, ways: Sequence[np.ndarray], velocity: np.ndarray, counts: Counts
+) -> CameraEstimate:
+    """Readout of raw frames too few for parts of the sequence: each frame's own motion during it,
+    found from some points, has to predict the other points, better than any other way of reading
+    rows does, and better than lenses that take their pictures at two instants.
+
+    Motion that all frames share is no evidence: a lens that is modelled roughly looks like it.
+    """
+    lenses, shown, frames = rays.lenses, rays.shown, rays.keypoints.frames()
+    said = rays.context.settings.camera.readout() or LIKELY
+    found = CameraEstimate(lenses, *said, counts=counts, of_few_frames=True)
+    sigmas = own_sigmas(found, velocity)
+    times = [lenses.fractions(shown, frames, way) for way in ways]
+    times.append(0.5 - lenses.facing(shown, frames) / (lenses.num_lenses - 1))  # two instants
+
+    def moved(times: np.ndarray, seen: Weighted) -> np.ndarray:
+        return times[seen.rows, None, None] * seen.by_pose
+
+    models = [frame_models(rays.drawn, partial(moved, each)) for each in times]
+    verdicts = [validated(model, sigmas, alike=True) for model in models]
+    gains = [verdict.gains for verdict in verdicts]
+    best = int(np.argmax([gain.sum() for gain in gains]))
+    logger.debug("readout of few frames: gains %s", [round(float(gain.sum()), 1) for gain in gains])
+    left, reason = [predicts(gains[best] - gain) for gain in gains], ""
+    if not verdicts[best].predicts:
+        reason = "motion during the readout does not predict unseen points"
+    elif not left[-1]:
+        reason = TWO_INSTANTS
+    elif not all(left[:best] + left[best + 1 :]):
+        reason = "rows may be read in other directions as well"
+    if reason:
+        return CameraEstimate(lenses, gains=verdicts[best].shares, reason=reason, counts=counts)
+    own = frame_step(models[best], sigmas).reshape(len(velocity), -1)[:, 6:]
+    taken = replace(lenses, row_directions=ways[best], readout_motion=own)
+    return replace(found, lenses=taken, gains=verdicts[best].shares)
+
+
 def without_vanished(found: CameraEstimate) -> CameraEstimate:
     """The adjusted estimate, read at one instant if little is left of the duration that was taken.
 
     Seams that optical flow has aligned look like motion along the velocity, until each frame moves
     as it likes.
     """
-    if found.lenses.readout_motion is None or not (
-        found.readout_s < _MIN_SIGMAS * found.readout_sigma
+    if (
+        found.lenses.readout_motion is None
+        or found.of_few_frames
+        or not (found.readout_s < _MIN_SIGMAS * found.readout_sigma)
     ):
         return found
     lenses = replace(found.lenses, row_directions=None, readout_motion=None)

@@ -8,6 +8,7 @@ from functools import cached_property, partial
 from typing import TypeVar
 
 import numpy as np
+from scipy.sparse import csc_array
 from scipy.sparse import diags_array as diags
 from scipy.sparse.linalg import splu
 
@@ -352,23 +353,35 @@ def frame_models(
         return list(pool.map(model, range(PARTS)))
 
 
-def _frame_step(models: Sequence[FrameModel], sigmas: np.ndarray) -> np.ndarray:
+def frame_step(models: Sequence[FrameModel], sigmas: np.ndarray, alike: bool = False) -> np.ndarray:
     """Change of poses and parameters (F * (6 + K),) by all points of the models; sigmas: (K,) how
-    strongly the parameters are drawn to what they are; 0 = they stay."""
-    systems = [model.system for model in models]
+    strongly the parameters are drawn to what they are; 0 = they stay. alike: all frames change
+    their parameters by the same."""
+    systems, num = [model.system for model in models], 6 + len(sigmas)
     gradient = np.sum([system.gradient for system in systems], axis=0)
     hessian = sum(system.hessian for system in systems[1:]) + systems[0].hessian
     hessian = hessian * float(np.mean([model.curvature for model in models]))
-    held = _POSE_DAMPING * hessian.diagonal().reshape(-1, 6 + len(sigmas))
+    held = _POSE_DAMPING * hessian.diagonal().reshape(-1, num)
     held[held <= 0] = 1.0
     held[:, 6:] = np.maximum(sigmas, 1e-12) ** -2.0
-    return -splu((hessian + diags(held.ravel())).tocsc()).solve(gradient)
+    if not alike:
+        return -splu((hessian + diags(held.ravel())).tocsc()).solve(gradient)
+    frames, columns = np.arange(len(held))[:, None], np.arange(num)
+    last = 6 * len(held)  # where the parameters that frames share start
+    shared = np.where(columns < 6, 6 * frames + columns, last + columns - 6).ravel()
+    ones = np.ones(len(shared))
+    spread = csc_array((ones, (np.arange(len(shared)), shared)), (len(shared), last + num - 6))
+    held[:, 6:] /= len(held)
+    whole = spread.T @ (hessian + diags(held.ravel())) @ spread
+    return -(spread @ splu(whole.tocsc()).solve(spread.T @ gradient))
 
 
-def validated(models: Sequence[FrameModel], sigmas: np.ndarray) -> PartGains:
-    """Verdict on parameters with priors `sigmas` (K,), poses solved for with and without them."""
+def validated(models: Sequence[FrameModel], sigmas: np.ndarray, alike: bool = False) -> PartGains:
+    """Verdict on parameters with priors `sigmas` (K,), poses solved for with and without them, or,
+    where `alike`, with the same parameters for all frames instead of none."""
+    before = sigmas if alike else np.zeros_like(sigmas)
     return cross_validate(
         models,
-        lambda others: _frame_step(others, sigmas),
-        lambda others: _frame_step(others, np.zeros_like(sigmas)),
+        lambda others: frame_step(others, sigmas),
+        lambda others: frame_step(others, before, alike),
     )

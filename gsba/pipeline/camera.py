@@ -290,7 +290,9 @@ def _missing_parts(
         return
     if number == 0:
         if lenses.readout_motion is None and one.estimate().reason != readout.VANISHED:
-            yield "readout", readout.estimate, CameraEstimate
+            plain = run.frames.formats[camera].lenses_nominal and lenses.fisheyes is None
+            find = partial(readout.estimate, few_frames=raw and not plain)
+            yield "readout", find, CameraEstimate
         return
     if raw and lenses.fisheyes is None:  # the rest has settled
         yield "calibrated", _calibration(run, camera), SelfCalibration

@@ -7,7 +7,7 @@ import numpy as np
 from gsba.bundle.camera_adjustment import CameraSigmas
 from gsba.bundle.found_camera import FoundCamera
 from gsba.bundle.lens_centres import baseline_of, radius_sigma
-from gsba.bundle.readout import CameraEstimate
+from gsba.bundle.readout import TWO_INSTANTS, CameraEstimate
 from gsba.bundle.self_calibration import first_of, num_parameters, undetermined
 from gsba.camera.fisheye import lens_names
 from gsba.camera.lens import all_centres
@@ -97,6 +97,8 @@ def of_camera(
         }
         if timed:
             notes += _readout_notes(readout, settings)
+        if readout.reason == TWO_INSTANTS:
+            notes.append(f"{TWO_INSTANTS}: poses are between these, and less exact than they say")
     return content, notes
 
 

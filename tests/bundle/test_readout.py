@@ -5,13 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from lens_world import motion, placed, problem_of, seen_through, solved_under, solved_with, times
-from synthetic import loop_walk
+from scipy.spatial.transform import Rotation
+from synthetic import World, loop_walk
 
 from gsba.bundle import readout
 from gsba.bundle.readout import CameraEstimate
 from gsba.bundle.shared_parameters import ObservedRays
 from gsba.camera.lens import Lenses
-from gsba.types import Fisheye, Solution
+from gsba.geometry import pose
+from gsba.types import Fisheye, Keypoints, Solution
 
 FISHEYE = Fisheye(960, 960, 300.0, (480.0, 480.0), (0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 
@@ -149,3 +151,57 @@ def test_a_duration_that_vanishes_beside_frames_own_motion_is_dropped() -> None:
     assert kept.lenses.readout_motion is None and kept.lenses.row_directions is None
     true = replace(found, readout_s=0.05 * READOUT_S)
     assert readout.without_vanished(true) is true
+
+
+PAIR = FISHEYE, replace(FISHEYE, rotation=(0.0, np.pi, 0.0))
+RAW = replace(Lenses.of_raw(PAIR), centre=np.array([0.0, 0.0, 0.05]))
+DOWN, FEW = np.array([[0.0, 1.0, 0.0], [0.0, 1.0, 0.0]]), 6
+FEW_POSES = loop_walk(24)[:FEW]
+FEW_MOTION = TWISTS[:FEW] * np.repeat([3.0, 1.0], 3)  # 0.3 degrees, as of hands
+
+
+def _of_few(world: World, shown: Keypoints, few_frames: bool = True) -> tuple:
+    start = Solution.without_points(world.world_T_rigs)
+    solved, keypoints, tracks = solved_under(world, shown, RAW, start)
+    around, problem = placed(solved, keypoints, tracks), problem_of(world)
+    given = keypoints, problem, RAW, shown.bearings_rig, times(FEW)
+    rays = ObservedRays(replace(solved, landmarks=around), *given)
+    return solved, problem, readout.estimate(rays, few_frames)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("up", [1.0, -1.0])
+def test_few_raw_frames_show_their_own_motion(seed: int, up: float) -> None:
+    way = DOWN * [[1.0], [up]]
+    swept = replace(RAW, row_directions=way, readout_motion=FEW_MOTION)
+    world, shown = seen_through(swept, seed, FEW_POSES, FEW)
+    _, _, untold = _of_few(world, shown, few_frames=False)
+    assert untold.reason == "too few points to tell rows apart"
+    solved, problem, found = _of_few(world, shown)
+    assert not found.reason and (found.gains > 0).all()
+    np.testing.assert_allclose(found.lenses.row_directions, way, atol=1e-9)
+    solved, found = solved_with(world, shown, found, solved, problem)
+    assert readout.without_vanished(found) is found and found.lenses.readout_motion is not None
+    left = np.sqrt(np.mean((found.lenses.readout_motion - FEW_MOTION)[:, :3] ** 2))
+    assert left < 0.4 * np.sqrt(np.mean(FEW_MOTION[:, :3] ** 2))
+    assert solved.noise < 1.1
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_few_raw_frames_of_one_instant_have_no_readout(seed: int) -> None:
+    _, _, found = _of_few(*seen_through(RAW, seed, FEW_POSES, FEW))
+    assert found.reason == "motion during the readout does not predict unseen points"
+    assert found.lenses is RAW
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_lenses_of_two_instants_are_no_readout(seed: int) -> None:
+    """The back lens takes its picture when the rig has moved on: nothing depends on rows."""
+    world, shown = seen_through(RAW, seed, FEW_POSES, FEW)
+    moves = pose(Rotation.from_rotvec(FEW_MOTION[:, :3]).as_matrix(), FEW_MOTION[:, 3:])
+    _, later = seen_through(RAW, seed, FEW_POSES @ moves, FEW)
+    back = RAW.facing(shown.bearings_rig, shown.frames()) == 1
+    bearings = np.where(back[:, None], later.bearings_rig, shown.bearings_rig)
+    _, _, found = _of_few(world, replace(shown, bearings_rig=bearings))
+    assert found.reason == readout.TWO_INSTANTS
+    assert found.lenses.row_directions is None and found.lenses.readout_motion is None
