@@ -20,7 +20,8 @@ from gsba.camera.sphere import erp_from_bearings
 from gsba.camera.views import lens_views
 from gsba.config import RefineSettings
 from gsba.demo.degrade import degrade
-from gsba.demo.render import render_erp
+from gsba.demo.render import Eye, render_erp, render_eye
+from gsba.demo.two_lenses import poses_during
 from gsba.demo.walk import walk_poses
 from gsba.evaluate import TrajectoryErrors, evaluate
 from gsba.frames.files import decode
@@ -213,6 +214,34 @@ def test_a_calibration_is_not_for_panoramas(walk: Path, tmp_path: Path) -> None:
             calibration=walk / "true.json",
         )  # fmt: skip
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("readout_s", [0.02, 0.0])
+def test_six_frames_tell_rows_read_one_after_another(readout_s: float, tmp_path: Path) -> None:
+    truth, scene = walk_poses("rectangle", "forward", 24, 0), gallery()
+    truth = Trajectory(truth.timestamps[:6], truth.world_T_rigs[:6])
+    during = poses_during(truth, readout_s, 0)[:, :, :3]
+    for name, lens, side in zip(("front", "back"), LENSES, (1.0, -1.0), strict=True):
+        (tmp_path / "frames" / name).mkdir(parents=True)
+        maps = _maps(lens)
+        for f, poses in enumerate(during):
+            eyes = poses.copy()
+            eyes[:, :, 3] += side * 0.5 * BASELINE * poses[:, :, 2]
+            eye = Eye(eyes, side, (0.0, 1.0), np.deg2rad(100), BEND[:2], -0.2)
+            erp = render_eye(scene, eye, 1024, 512).clip(0, 255).astype(np.uint8)
+            picture = cv2.remap(erp, maps[0], maps[1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_WRAP)
+            picture[np.isnan(maps[0])] = 0
+            cv2.imwrite(str(tmp_path / "frames" / name / f"{f:04d}.png"), picture[..., ::-1])
+    rows = [f"{f:04d},{time!r}" for f, time in enumerate(truth.timestamps.tolist())]
+    (tmp_path / "frames/timestamps.csv").write_text("\n".join(rows))
+    _write(tmp_path / "true.json", LENSES)
+    given = tmp_path / "frames", None, tmp_path / "run", RAW_SETTINGS
+    result = refine(*given, calibration=tmp_path / "true.json")
+    camera = result.report["camera"]
+    assert camera["readout"]["taken"] == bool(readout_s)
+    errors = evaluate(read_trajectory(tmp_path / "run/trajectory.tum"), truth)
+    assert errors.ate.rmse < 0.001
+    assert camera["baseline"] * errors.scale == pytest.approx(BASELINE, rel=0.02)
 
 
 REAL = Path(__file__).parents[3] / "shared/data/real"
