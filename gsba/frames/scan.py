@@ -102,7 +102,9 @@ def scan(
     layout, faces, found = _find_frames(Path(folder))
     if len(found) < min_frames:
         num = "1 frame" if len(found) == 1 else f"{len(found)} frames"
-        raise GsbaError(f"{folder}: {num}; at least {min_frames} are needed")
+        below = _in_subfolders(Path(folder))
+        more = f" ({below})" if below else ""
+        raise GsbaError(f"{folder}: {num}; at least {min_frames} are needed{more}")
     names, times, timed = _in_time_order(Path(folder), found, timestamps, fps, order_suffices)
     paths = tuple(found[name] for name in names)
     tracks = track_size(Path(folder), paths) if layout == "eac" else None
@@ -302,7 +304,7 @@ def _find_frames(folder: Path) -> tuple[str, tuple[str, ...], dict[str, tuple[Pa
         }
         return "cube", *_cube_frames(folder, by_face)
     if not images:
-        raise _no_images(folder, entries, others, foreign)
+        raise _no_images(folder, others, foreign)
     tagged = {path: m for path in images if (m := re.fullmatch(_TAGGED, path.stem))}
     tags = {match["face"].lower() for match in tagged.values()}
     if not tags.issuperset(_SIDE_FACES) and len(tagged) < len(images):
@@ -319,25 +321,29 @@ def _find_frames(folder: Path) -> tuple[str, tuple[str, ...], dict[str, tuple[Pa
     return "cube", *_cube_frames(folder, by_face)
 
 
-def _no_images(
-    folder: Path, entries: Sequence[Path], others: Sequence[str], foreign: str
-) -> GsbaError:
+def _in_subfolders(folder: Path) -> str:
+    """Where pictures are in folders of a folder, and what to do about it; "" = there are none."""
+    folders = [path for path in entries_of(folder) if path.is_dir() and path.name[0] != "."]
+    below = [path for path in folders if any(map(is_image, entries_of(path)))]
+    if len(below) < 2:
+        return f"its pictures are in {below[0]}: give that folder" if below else ""
+    names = ", ".join(path.name for path in below[:5]) + (", ..." if len(below) > 5 else "")
+    paths = " ".join(shlex.quote(str(path)) for path in below[:3])
+    paths += " ..." if below[3:] else ""
+    return (
+        f"its pictures are in {len(below)} folders ({names}): give one of them, or all as "
+        f"recordings of one place (gsba refine {paths} --out RUN)"
+    )
+
+
+def _no_images(folder: Path, others: Sequence[str], foreign: str) -> GsbaError:
     """The refusal of a folder without pictures."""
     if foreign:
         return GsbaError(
             f"{folder}: no JPEG, PNG, WebP or TIFF images, but {foreign}: convert them first"
         )
-    folders = [path for path in entries if path.is_dir() and path.name[0] != "."]
-    if below := [path for path in folders if any(map(is_image, entries_of(path)))]:
-        names = ", ".join(path.name for path in below[:5]) + (", ..." if len(below) > 5 else "")
-        if len(below) == 1:
-            return GsbaError(f"{folder}: its pictures are in {below[0]}: give that folder")
-        paths = " ".join(shlex.quote(str(path)) for path in below[:3])
-        paths += " ..." if below[3:] else ""
-        return GsbaError(
-            f"{folder}: its pictures are in {len(below)} folders ({names}): give one of them, or "
-            f"all as recordings of one place (gsba refine {paths} --out RUN)"
-        )
+    if below := _in_subfolders(folder):
+        return GsbaError(f"{folder}: {below}")
     counts = Counter(Path(name).suffix.lower() or Path(name).name for name in others)
     held = ", ".join(f"{n} {kind}" for kind, n in sorted(counts.items())[:5]) or "nothing"
     return GsbaError(

@@ -313,9 +313,12 @@ def coverage_differences(axes: np.ndarray, pixel: float, steps_px: np.ndarray) -
         pixel: radians of a pixel of either frame.
         steps_px: (N,) pixels of the host to a template's pixel.
     """
-    covered = pixel * np.linalg.pinv(axes)  # template pixels that a pixel covers
-    own = steps_px[:, None, None] ** -2.0 * np.eye(2)
-    return np.linalg.norm(covered @ np.swapaxes(covered, 1, 2) - own, axis=(1, 2))
+    (a, b), (c, d) = np.moveaxis(axes, 0, 2) / pixel
+    # covariances of what a pixel covers, in template pixels: the inverse of axes' products
+    scale = np.maximum((a * d - b * c) ** 2, 1e-12)
+    xx, xy, yy = (b * b + d * d) / scale, (a * b + c * d) / scale, (a * a + c * c) / scale
+    own = steps_px**-2.0
+    return np.sqrt((xx - own) ** 2 + (yy - own) ** 2 + 2 * xy**2)
 
 
 def _normals_world(
@@ -439,11 +442,11 @@ def shown_slopes(
     """
     rounding = 1 / 12  # variance of grey values that are whole numbers
     noise = (variances + rounding)[:, None, None] * np.eye(4) + _AFFINE_SIGMA**2 * informations
-    known = np.concatenate([informations, posteriors @ warps[:, 2:, None]], axis=2)
-    weighted = np.linalg.solve(noise, known)
-    blocks = weighted[:, :, :4].reshape(-1, 2, 2, 2, 2)
-    weights = np.einsum("oi,oaibj,oj->oab", shifts, blocks, shifts)
-    return weights, np.einsum("oi,oai->oa", shifts, weighted[:, :, 4].reshape(-1, 2, 2))
+    by_slope = np.zeros((len(shifts), 4, 2))  # the affine part's Jacobian
+    by_slope[:, :2, 0] = by_slope[:, 2:, 1] = shifts
+    known = np.concatenate([informations @ by_slope, posteriors @ warps[:, 2:, None]], axis=2)
+    found = np.swapaxes(by_slope, 1, 2) @ np.linalg.solve(noise, known)
+    return found[:, :, :2], found[:, :, 2]
 
 
 def surface_normals(

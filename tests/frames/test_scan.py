@@ -164,9 +164,14 @@ def test_refused_folders(tmp_path: Path, folder: Path) -> None:
     refused(r"is a file", scan, folder / "0000.jpg", fps=1)
     (tmp_path / "empty").mkdir()
     refused(r"no JPEG, PNG, WebP or TIFF", scan, tmp_path / "empty", fps=1)
+    refused(rf"its pictures are in {folder}: give that folder", scan, tmp_path, fps=1)
+    write_image(tmp_path / "mask.png")
+    refused(rf"1 frame; .* needed \(its pictures are in {folder}: give", scan, tmp_path, fps=1)
+    write_images(tmp_path / "other", "a")
+    refused(r"in 2 folders \(frames, other\): give one of them, or all", scan, tmp_path, fps=1)
     for name in ("0002.jpg", "0003.jpg"):
         (folder / name).unlink()
-    refused(r"2 frames; at least 3", scan, folder, fps=1)
+    refused(r"2 frames; at least 3 are needed$", scan, folder, fps=1)
 
 
 def test_refused_frames(folder: Path) -> None:

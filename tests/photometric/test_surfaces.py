@@ -6,7 +6,13 @@ from scipy.spatial.transform import Rotation
 
 from factors import tangent_basis
 from factors.patches import Sightings, expect
-from gsba.photometric.alignment import depth_shifts, shown_slopes, slopes_of, surface_normals
+from gsba.photometric.alignment import (
+    coverage_differences,
+    depth_shifts,
+    shown_slopes,
+    slopes_of,
+    surface_normals,
+)
 
 STEP = 2 * np.pi / 1536
 POINT = np.array([0.4, -0.3, 2.0])  # seen from the host at the origin
@@ -93,6 +99,19 @@ def test_slopes_are_those_of_the_surface() -> None:
         ray = ORIGIN + SPREAD @ step
         depth = (surface @ ORIGIN) / (surface @ ray)
         assert depth == pytest.approx(1 + slopes @ step, abs=1e-4)
+
+
+def test_pixels_of_two_pictures_cover_a_surface_differently() -> None:
+    rng = np.random.default_rng(0)
+    axes = STEP * (np.eye(2) + 0.2 * rng.normal(size=(50, 2, 2)))
+    steps = rng.uniform(1, 1.4, 50)
+    found = coverage_differences(axes, STEP, steps)
+    square = STEP * np.eye(2)
+    for one, step, difference in zip(axes, steps, found, strict=True):
+        covered = np.linalg.solve(one, square)  # edges of a pixel, in template pixels
+        assert difference == pytest.approx(
+            np.linalg.norm(covered @ covered.T - np.eye(2) / step**2), rel=1e-9
+        )
 
 
 def test_steep_and_unknown_surfaces() -> None:
