@@ -13,6 +13,7 @@ from gsba.geometry import extent_of
 from gsba.log import GsbaError, brief
 from gsba.placement.frame_fixes import fixes_of_frames, read_fixes
 from gsba.placement.gps_fit import GpsFit, fit_fixes
+from gsba.placement.gps_shape import are_mirrored, lag_of, positions_at
 from gsba.placement.world import Placement
 from gsba.scans.files import check_scan, normals_of, read_pairs, read_scan, upwards
 from gsba.scans.registration import in_file, register
@@ -275,6 +276,25 @@ def _on_earth(
         raise GsbaError(
             f"{path}: the frames lie on a line, which determines no roll: add --up auto"
         )
+    good = reconstruction.pose_statuses == PoseStatus.REFINED
+    times, everywhere = frames.timestamps[good], reconstruction.world_T_rigs[good, :3, 3]
+    lag = lag_of(fixes, times, everywhere @ level.T, level=up_sigma is not None)
+    if lag:
+        assert fixes.times is not None  # lags are seconds
+        positions, known = positions_at(fixes.times - lag, times, everywhere)
+        fixes, positions = fixes.taken(known), positions[known]
+        logger.warning(
+            "--gps %s: its positions are %.1f s %s the frames by the shapes of both paths; they "
+            "were moved by that: if it is wrong, check the file's times",
+            path,
+            abs(lag),
+            "behind" if lag > 0 else "ahead of",
+        )
+    if up_sigma is not None and are_mirrored(fixes, positions @ level.T):
+        raise GsbaError(
+            f"{path}: its positions fit the mirror image of the run better: in the file, latitude "
+            "and longitude are swapped, or the sign of one of them is missing"
+        )
     with naming(path):
         found = fit_fixes(positions @ level.T, fixes, up_sigma, scale)
     off = residuals_of(found.similarity, positions @ level.T, fixes.positions)
@@ -314,6 +334,7 @@ def _on_earth(
             "heading_sigma_deg": float(np.degrees(found.heading_sigma)),
             "tilt_sigma_deg": float(np.degrees(found.tilt_sigma)),
             "position_sigma_m": np.median(sigmas, axis=0).tolist(),  # east, north and up
+            "lag_s": lag,  # by which fixes are behind their frames
         },
     }
     logger.info(
