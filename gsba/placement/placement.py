@@ -321,7 +321,7 @@ def _on_earth(
             "refuses such positions",
             path,
         )
-    sigmas = found.position_sigmas(positions @ level.T)
+    sigmas = found.position_sigmas(everywhere @ level.T)  # also where there are no fixes
     grounds = {
         **upright.grounds,
         "gps": {
@@ -334,13 +334,14 @@ def _on_earth(
             "heading_sigma_deg": float(np.degrees(found.heading_sigma)),
             "tilt_sigma_deg": float(np.degrees(found.tilt_sigma)),
             "position_sigma_m": np.median(sigmas, axis=0).tolist(),  # east, north and up
+            "largest_position_sigma_m": sigmas.max(axis=0).tolist(),
             "lag_s": lag,  # by which fixes are behind their frames
         },
     }
     logger.info(
         "--gps %s: %d of %d positions are inliers, with an RMS residual of %.3g m, at latitude "
         "%.5f, longitude %.5f; sigmas: scale %.2g %%, heading %.2g degrees, tilt %.2g degrees, "
-        "position %.2g m",
+        "position %.2g m, at most %.2g m",
         path,
         found.used.sum(),
         len(fixes),
@@ -349,7 +350,8 @@ def _on_earth(
         100 * found.scale_sigma,
         np.degrees(found.heading_sigma),
         np.degrees(found.tilt_sigma),
-        grounds["gps"]["position_sigma_m"][0],
+        np.median(sigmas[:, 0]),
+        sigmas[:, 0].max(),
     )
     where = (float(fixes.origin[0]), float(fixes.origin[1]), float(fixes.origin[2]))
     return Placement(fit, unit="m", up="z", origin=where, grounds=grounds)

@@ -206,6 +206,18 @@ def test_fixes_of_insta360_are_on_the_clock_of_the_video(tmp_path: Path) -> None
     refused("holds no GPS", read_video_gps, path)
 
 
+def test_the_offset_of_a_clock_counts_in_videos_and_never_for_names(tmp_path: Path) -> None:
+    path, late = tmp_path / "VID_20240101_120000_00_001.insv", GpsSettings(offset_s=-2.5)
+    fixes = b"".join(insta360_files.fix(1_700_000_000 + n, -10.5, 20.25) for n in range(3))
+    path.write_bytes(b"pictures" + insta360_files.trailer([(0, insta360_files.GPS, fixes)]))
+    found = read_fixes(str(path), None, late)
+    assert found is not None and found.timestamps is not None
+    np.testing.assert_allclose(found.timestamps, np.arange(3) - 2.5)
+    names = tmp_path / "names.csv"
+    names.write_text("name,lat,lon\na,48,11\nb,48,11.001\nc,48,11.002\n")
+    refused("--gps-offset -2.5 is added to times", read_fixes, str(names), None, late)
+
+
 def test_points_of_a_gpx_track_that_share_seconds_are_spread(tmp_path: Path) -> None:
     points = "".join(
         f'<trkpt lat="48" lon="{11 + 1e-5 * n}"><time>2024-05-01T10:00:0{n // 3}Z</time></trkpt>'

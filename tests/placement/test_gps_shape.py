@@ -14,6 +14,7 @@ from gsba.config import PlacementSettings
 from gsba.geometry import pose
 from gsba.log import GsbaError
 from gsba.placement import placement as placing
+from gsba.placement.gps import local_from_geodetic
 from gsba.placement.gps_shape import are_mirrored, lag_of
 from gsba.placement.placement import place
 from gsba.placement.world import Placement
@@ -97,3 +98,21 @@ def test_a_mirrored_file_is_refused_where_up_is_known(tmp_path: Path) -> None:
     upright = Placement(Sim3(rotation=np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])), up="-y")
     with pytest.raises(GsbaError, match=r"gps\.csv: its positions fit the mirror image"):
         placing._on_earth(run, frame_set(120), str(file), upright)
+
+
+def test_frames_beyond_the_fixes_are_less_certain(tmp_path: Path) -> None:
+    """Sigmas were those of the frames with fixes alone, here the first half of a walk."""
+    times, rng = STEP_S * np.arange(NUM), np.random.default_rng(5)
+    path, errors = _walk(rng), []
+    turns = Rotation.from_rotvec(rng.normal(0, 0.3, (NUM, 3))).as_matrix()
+    run = dataclasses.replace(walk_result(NUM), world_T_rigs=pose(turns, path))
+    for _ in range(20):
+        some = (path + lasting_errors(times, rng))[: NUM // 2]
+        file = write_fixes(tmp_path / "gps.csv", times[: NUM // 2], geodetic_of(some))
+        placed = place(run, frame_set(NUM), PlacementSettings(gps=str(file)))
+        assert placed.origin is not None
+        off = placed.similarity.points(path) - local_from_geodetic(
+            geodetic_of(path), np.array(placed.origin)
+        )
+        errors.append(np.abs(off).max(axis=0) / placed.grounds["gps"]["largest_position_sigma_m"])
+    assert np.sqrt(np.mean(np.square(errors))) < 1.5
