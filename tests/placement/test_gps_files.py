@@ -73,6 +73,22 @@ def test_fixes_by_name_stay_with_a_recording_that_others_are_added_to(tmp_path: 
         assert found.tolist() == list(range(first, first + 4))
 
 
+@pytest.mark.parametrize("begin", [0.0, 1.7e9])
+def test_times_from_the_start_of_a_recording_are_not_those_of_another(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, begin: float
+) -> None:
+    """They placed frames of both; two cameras that show Unix time were carried along together."""
+    one = replace(frame_set(4), timestamps=begin + 0.5 * np.arange(4))
+    paths = tuple((Path(f"other{n}"),) for n in range(5))
+    other = replace(frame_set(5), timestamps=begin + 0.5 * np.arange(5), paths=paths)
+    both, path = combine({"one": one, "other": other}), tmp_path / "gps.csv"
+    rows = [f"{begin + 0.5 * n},48.000{n},11,500" for n in range(4)]
+    path.write_text("\n".join(["timestamp,latitude,longitude,altitude", *rows]))
+    found = fixes_of_frames(str(path), both).frames.tolist()
+    assert found == [0, 1, 2, 3, *(range(4, 8) if begin else [])]
+    assert ("not of 'other', whose clock shows the same" in caplog.text) == (begin == 0)
+
+
 def test_altitudes_are_all_or_none() -> None:
     geodetic = np.array([[48, 11, np.nan], [48, 11, 500.0], [48, 11, 501], [48, 11, 502]])
     some = fixes_of([3.0, 1, 2, 0], geodetic)
