@@ -244,6 +244,13 @@ def _with_reason(
     # a tenth of the steps must turn by a degree
     if np.quantile(np.linalg.norm(turns.rotvecs, axis=1), 0.9) < np.deg2rad(1.0):
         return replace(found, reason="the camera turns too little to determine the gyro's clock")
+    reversed_ = replace(best.readings, rates=-best.readings.rates)
+    other = _Candidate.of(turns, reversed_, parameters, -best.sensor.bias).fit
+    if noise(other.residuals(parameters)) < 0.5 * sigma:  # of a mirror image of the axes
+        return replace(
+            found,
+            reason="the gyro's axes are left-handed: one is reversed, or two are exchanged",
+        )
     if share < _MIN_EXPLAINED or fit.turning(sigma).sum() < MIN_TURNS:
         return replace(found, reason="the gyro's rotations fit the images at no clock offset")
     if rival > 0.75 * share:  # share of the best offset's explained turns that no rival may reach
