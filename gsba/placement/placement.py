@@ -40,6 +40,7 @@ _TOLERANCE_S = 0.02  # largest time from a frame to its true pose
 _MAX_LENS_SCALE_SIGMA = 0.1  # relative, of a scale by the lenses
 _MAX_GPS_ANGLE_SIGMA_DEG = 25.0  # of heading and tilt by GPS
 _MAX_SCALE_SIGMAS = 4.0  # of two scales that agree: true ones differ by more once in 16,000 runs
+_MEASURED_SIGMA = 0.02  # relative, of a scale by a tape measure
 _NUM_NAMED = 5  # false positions that a message names
 _UPSIDE_DOWN = -0.5  # vertical component of the cameras' up axes: 120 degrees from up
 _MIN_EXTENT_RATIO = 0.02  # of a path's second extent to its first: less determines no roll
@@ -62,13 +63,16 @@ def place(
             the weighted mean of both; "exif" uses the positions in the images. `align` gives the
             world of true poses, `scan` that of a scan of the place; with a scan, `up`, `gps` or
             `pairs` only start the alignment.
-        baseline: distance of the lenses and its standard deviation, metres, for a length of "lens".
+        baseline: distance of the lenses and its standard deviation, metres, for a length of "lens";
+            other scales that contradict it are warned of.
 
     Raises:
         GsbaError: settings exclude one another, or data do not determine the placement.
     """
     check(settings, baseline=baseline)
     placement = _placement(reconstruction, frames, settings, baseline, gps)
+    if placement.unit == "m" and settings.length != "lens":
+        _warn_of_lenses(placement, reconstruction, baseline)
     placed = placement.similarity.points(reconstruction.world_T_rigs[:, :3, 3])
     far = np.abs(placed).max(initial=0)
     scale = placement.similarity.scale
@@ -218,6 +222,26 @@ def _scale_by_lenses(
     return (scale, sigma), {"baseline_m": baseline[0], "scale_sigma": sigma}
 
 
+def _warn_of_lenses(
+    placement: Placement, reconstruction: Reconstruction, baseline: tuple[float, float] | None
+) -> None:
+    """Warn of a metric scale that contradicts the distance between the lenses, if that is known."""
+    if baseline is None or reconstruction.lens_baseline is None:
+        return
+    scale = placement.similarity.scale
+    lens, sigma = metres_per_unit(reconstruction.lens_baseline, baseline)
+    own = placement.grounds.get("gps", {}).get("scale_sigma", _MEASURED_SIGMA * scale) / scale
+    if abs(np.log(scale / lens)) > _MAX_SCALE_SIGMAS * np.hypot(own, sigma / lens):
+        logger.warning(
+            "the run is placed with %.4g m to a map unit, but the distance between its lenses "
+            "gives %.4g (sigma %.2g %%): check the length or positions that were given, and the "
+            "camera",
+            scale,
+            lens,
+            100 * sigma / lens,
+        )
+
+
 def _least_turn(source: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Smallest rotation (3, 3) that maps one unit vector to another."""
     axis, cosine = np.cross(source, target), float(source @ target)
@@ -234,7 +258,12 @@ def _least_turn(source: np.ndarray, target: np.ndarray) -> np.ndarray:
 def _point(text: str, reconstruction: Reconstruction, frames: FrameSet) -> np.ndarray:
     """Position (3,), run's world, of a frame by name or of "x,y,z"."""
     if text in frames.names:
-        return reconstruction.world_T_rigs[frames.names.index(text), :3, 3]
+        f = frames.names.index(text)
+        if reconstruction.pose_statuses[f] != PoseStatus.REFINED:
+            raise GsbaError(
+                f"--between {brief(text)}: its pose was not refined: choose another frame"
+            )
+        return reconstruction.world_T_rigs[f, :3, 3]
     try:
         point = np.array([float(part) for part in text.split(",")])
     except ValueError:
