@@ -309,16 +309,7 @@ def _on_earth(
     times, everywhere = frames.timestamps[good], reconstruction.world_T_rigs[good, :3, 3]
     lag = lag_of(fixes, times, everywhere @ level.T, level=up_sigma is not None)
     if lag:
-        assert fixes.times is not None  # lags are seconds
-        positions, known = positions_at(fixes.times - lag, times, everywhere)
-        fixes, positions = fixes.taken(known), positions[known]
-        logger.warning(
-            "--gps %s: its positions are %.1f s %s the frames by the shapes of both paths; they "
-            "were moved by that: if it is wrong, check the file's times",
-            path,
-            abs(lag),
-            "behind" if lag > 0 else "ahead of",
-        )
+        fixes, positions = _moved(path, fixes, lag, times, everywhere)
     if up_sigma is not None and are_mirrored(fixes, positions @ level.T):
         raise GsbaError(
             f"{path}: its positions fit the mirror image of the run better: in the file, latitude "
@@ -384,6 +375,23 @@ def _on_earth(
     )
     where = (float(fixes.origin[0]), float(fixes.origin[1]), float(fixes.origin[2]))
     return Placement(fit, unit="m", up="z", origin=where, grounds=grounds)
+
+
+def _moved(
+    path: Path, fixes: FrameFixes, lag: float, times: np.ndarray, positions: np.ndarray
+) -> tuple[FrameFixes, np.ndarray]:
+    """Fixes that are behind their frames by a lag, seconds, and the run's positions (G, 3) there;
+    times (F,) and positions (F, 3) are of all refined frames."""
+    assert fixes.times is not None  # lags are seconds
+    logger.warning(
+        "--gps %s: its positions are %.1f s %s the frames by the shapes of both paths; they were "
+        "moved by that: if it is wrong, check the file's times",
+        path,
+        abs(lag),
+        "behind" if lag > 0 else "ahead of",
+    )
+    at, known = positions_at(fixes.times - lag, times, positions)
+    return fixes.taken(known), at[known]
 
 
 def _require_majority(
