@@ -31,13 +31,13 @@ def lag_of(fixes: FrameFixes, times: np.ndarray, positions: np.ndarray, level: b
         return 0.0
     own, inside = positions_at(fixes.times, times, positions)
     most = int(min(_MAX_LAG_S, np.ptp(fixes.times) / 2))
-    lags, lag, gain = np.arange(-most, most + 1.0), 0.0, 0.0
-    for finer in (np.linspace(-1, 1, 9), np.linspace(-0.25, 0.25, 11)):
+    lag = gain = 0.0
+    for step, num in ((1.0, most), (0.25, 4), (0.05, 5)):  # seconds, and steps to either side
+        lags = lag + step * np.arange(-num, num + 1)
         moved, known = positions_at(fixes.times - lags[:, None], times, positions)
         gains = _gains(fixes, own, moved, known & inside, level)
         best = int(np.argmax(gains))
         lag, gain = float(lags[best]), float(gains[best])
-        lags = lag + finer
     return lag if gain > _MIN_GAIN else 0.0
 
 

@@ -384,7 +384,7 @@ def _moved(
     times (F,) and positions (F, 3) are of all refined frames."""
     assert fixes.times is not None  # lags are seconds
     logger.warning(
-        "--gps %s: its positions are %.1f s %s the frames by the shapes of both paths; they were "
+        "--gps %s: its positions are %.2f s %s the frames by the shapes of both paths; they were "
         "moved by that: if it is wrong, check the file's times",
         path,
         abs(lag),
