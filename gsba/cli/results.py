@@ -78,7 +78,7 @@ def export(
         refuse_changed_frames(run, reconstruction, frames)
     lenses = cameras_of(run, reconstruction, frames, images, map_number)
     folder = out or run / (name if map_number == 1 else f"{name}-map{map_number}")
-    known = _baseline(run, baseline) if scale == "lens" else None
+    known = _baseline(run, baseline) if (scale, gps) != (None, None) else None
     noise = _gps_settings(run, gps_sigma, gps_offset) if gps is not None else None
     placed = replace(place(reconstruction, frames, settings, known, noise), map_number=map_number)
     options = replace(

@@ -5,6 +5,7 @@ vectors; the bias is the part that grows with time alone). The best few are refi
 of a percent are estimated for each axis where rotations determine them.
 """
 
+import logging
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -17,11 +18,14 @@ from gsba.trajectory.clock import MIN_STEPS, MIN_TURNS, Clock, simplest
 from gsba.trajectory.clock_search import LOSS_WIDTH_SIGMAS, ClockFit, Turns, merged, noise
 from gsba.types import Counts, GyroConstraints, Trajectory
 
+logger = logging.getLogger(__name__)
+
 _MAX_SPACING_STEPS, _MAX_SPACING_S = 0.25, 0.05  # largest spacing of tried offsets: in steps, and
 # in seconds
 _MIN_EXPLAINED = 0.6  # least share of the turns that a gyro must explain
 _SCALE_SIGMA = 0.01  # prior standard deviation of a gyro's scale
 _RATE_SPAN_S = 0.01  # s over which an angular velocity is averaged
+_MAX_UP_SCATTER_DEG = 5.0  # median angle of a second's vertical to that of all
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,6 +244,13 @@ def _with_reason(
     # a tenth of the steps must turn by a degree
     if np.quantile(np.linalg.norm(turns.rotvecs, axis=1), 0.9) < np.deg2rad(1.0):
         return replace(found, reason="the camera turns too little to determine the gyro's clock")
+    reversed_ = replace(best.readings, rates=-best.readings.rates)
+    other = _Candidate.of(turns, reversed_, parameters, -best.sensor.bias).fit
+    if noise(other.residuals(parameters)) < 0.5 * sigma:  # of a mirror image of the axes
+        return replace(
+            found,
+            reason="the gyro's axes are left-handed: one is reversed, or two are exchanged",
+        )
     if share < _MIN_EXPLAINED or fit.turning(sigma).sum() < MIN_TURNS:
         return replace(found, reason="the gyro's rotations fit the images at no clock offset")
     if rival > 0.75 * share:  # share of the best offset's explained turns that no rival may reach
@@ -259,7 +270,8 @@ def up_axis(
 
     Forces are rotated into the world by the refined rotation (F, 3, 3) of the frame before and the
     gyro since then, and averaged over two steps each. Longer accelerations are outliers: the result
-    is the geometric median of the means.
+    is the geometric median of the means. Where these turn with the camera, the accelerometer has
+    other axes than the gyro.
     """
     if readings.forces is None:
         return None
@@ -282,4 +294,14 @@ def up_axis(
     right = np.abs(lengths - STANDARD_GRAVITY) < 0.2 * STANDARD_GRAVITY
     if right.sum() < 3:  # least number of such means
         return None
-    return median_direction(means[right] / lengths[right, None])
+    directions = means[right] / lengths[right, None]
+    up = median_direction(directions)
+    scatter = float(np.degrees(np.median(np.arccos(np.clip(directions @ up, -1, 1)))))
+    if scatter > _MAX_UP_SCATTER_DEG:
+        logger.warning(
+            "the accelerometer is not used: its vertical turns with the camera, by %.0f degrees in "
+            "the median: check that its axes are those of the gyro",
+            scatter,
+        )
+        return None
+    return up

@@ -20,6 +20,7 @@ logger = logging.getLogger(__name__)
 
 EXIF = "exif"  # in place of a file: positions in the EXIF data of the images
 MIN_FIXES = 3
+_UNIX_S = 1e9  # clocks that show more show Unix time: September 2001
 
 
 def read_exif_gps(frames: FrameSet, settings: GpsSettings | None = None) -> GpsFixes:
@@ -146,6 +147,26 @@ def _locked(source: str, fixes: GpsFixes) -> GpsFixes:
     )
 
 
+def _on_one_clock(source: str, frames: FrameSet, times: np.ndarray) -> np.ndarray:
+    """Frames (F,) bool without those of recordings whose clocks, unless they are Unix time, show
+    times (F,) of an earlier one: they count from recordings' starts, and fixes are of the first."""
+    told, spans = np.ones(len(times), bool), list[tuple[float, float]]()
+    for name, rows in frames.recordings.items():
+        begin, end = float(times[rows].min()), float(times[rows].max())
+        if begin < _UNIX_S and any(begin <= other[1] and other[0] <= end for other in spans):
+            told[rows] = False
+            logger.warning(
+                "--gps %s: its times are those of an earlier recording, not of '%s', whose clock "
+                "shows the same: give positions of both by name, as '%s'",
+                source,
+                name,
+                frames.names[rows[0]],
+            )
+        else:
+            spans.append((begin, end))
+    return told
+
+
 def _between(
     source: str, fixes: GpsFixes, frames: FrameSet
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -157,7 +178,7 @@ def _between(
             f"{source}: the frames have no times to interpolate positions at: refine with "
             "--timestamps"
         )
-    within = (times >= entries[0]) & (times <= entries[-1])
+    within = (times >= entries[0]) & (times <= entries[-1]) & _on_one_clock(source, frames, times)
     inside = np.flatnonzero(within & frames.timed_frames)
     if not len(inside):
         raise GsbaError(

@@ -51,16 +51,22 @@ def fixes_of(
     """Fixes sorted by time, with altitudes known for all or for none.
 
     Args:
-        keys: (G,) times in seconds on the frames' clock, distinct, in any order; or frames' names.
+        keys: (G,) times in seconds, distinct, in any order, to which the settings' offset is added;
+            or frames' names.
         geodetic: (G, 3) latitude, longitude (degrees), altitude (metres, NaN = not known). Fixes
             without an altitude are left out if at least three have one; else all altitudes are 0,
             with a sigma of 20 m.
         sigmas: (G, 3) standard deviations east, north and up, metres; None = the smallest that
             settings allow, see `sigmas_of`.
     """
-    geodetic = np.array(geodetic, np.float64).reshape(-1, 3)
-    sigmas = sigmas_of(settings or GpsSettings(), np.full(len(geodetic), np.nan), sigmas)
+    geodetic, settings = np.array(geodetic, np.float64).reshape(-1, 3), settings or GpsSettings()
+    sigmas = sigmas_of(settings, np.full(len(geodetic), np.nan), sigmas)
     named = len(keys) > 0 and isinstance(keys[0], str)
+    if named and settings.offset_s:
+        raise GsbaError(
+            f"--gps-offset {settings.offset_s:g} is added to times, but these positions are of "
+            "frames by name: leave it out (--gps-offset 0 on export)"
+        )
     order = np.arange(len(keys))
     if not named:
         order = np.argsort(np.array(keys, np.float64), kind="stable")
@@ -73,7 +79,8 @@ def fixes_of(
     geodetic[:, 1] = np.unwrap(geodetic[:, 1], period=360)  # no jump at the date line
     if named:
         return GpsFixes(tuple(str(keys[int(i)]) for i in order), None, geodetic, sigmas)
-    return GpsFixes(None, np.array(keys, np.float64)[order], geodetic, sigmas)
+    times = np.array(keys, np.float64)[order] + settings.offset_s
+    return GpsFixes(None, times, geodetic, sigmas)
 
 
 def sigmas_of(
@@ -250,8 +257,6 @@ def _checked_fixes(
                 f"{path} holds two positions {where}: positions {before} and {row}; remove one of "
                 "them"
             )
-    if not isinstance(keys[0], str):
-        keys = [float(key) + settings.offset_s for key in keys]
     dop, dop_up, error, error_up = np.array(noise).T
     known = {"dop_up": dop_up, "error_m": error, "error_up_m": error_up}
     return fixes_of(keys, np.array(rows), sigmas_of(settings, dop, **known), settings)

@@ -13,6 +13,7 @@ from gsba.geometry import extent_of
 from gsba.log import GsbaError, brief
 from gsba.placement.frame_fixes import fixes_of_frames, read_fixes
 from gsba.placement.gps_fit import GpsFit, fit_fixes
+from gsba.placement.gps_shape import are_mirrored, lag_of, positions_at
 from gsba.placement.world import Placement
 from gsba.scans.files import check_scan, normals_of, read_pairs, read_scan, upwards
 from gsba.scans.registration import in_file, register
@@ -39,6 +40,7 @@ _TOLERANCE_S = 0.02  # largest time from a frame to its true pose
 _MAX_LENS_SCALE_SIGMA = 0.1  # relative, of a scale by the lenses
 _MAX_GPS_ANGLE_SIGMA_DEG = 25.0  # of heading and tilt by GPS
 _MAX_SCALE_SIGMAS = 4.0  # of two scales that agree: true ones differ by more once in 16,000 runs
+_MEASURED_SIGMA = 0.02  # relative, of a scale by a tape measure
 _NUM_NAMED = 5  # false positions that a message names
 _UPSIDE_DOWN = -0.5  # vertical component of the cameras' up axes: 120 degrees from up
 _MIN_EXTENT_RATIO = 0.02  # of a path's second extent to its first: less determines no roll
@@ -61,13 +63,16 @@ def place(
             the weighted mean of both; "exif" uses the positions in the images. `align` gives the
             world of true poses, `scan` that of a scan of the place; with a scan, `up`, `gps` or
             `pairs` only start the alignment.
-        baseline: distance of the lenses and its standard deviation, metres, for a length of "lens".
+        baseline: distance of the lenses and its standard deviation, metres, for a length of "lens";
+            other scales that contradict it are warned of.
 
     Raises:
         GsbaError: settings exclude one another, or data do not determine the placement.
     """
     check(settings, baseline=baseline)
     placement = _placement(reconstruction, frames, settings, baseline, gps)
+    if placement.unit == "m" and settings.length != "lens":
+        _warn_of_lenses(placement, reconstruction, baseline)
     placed = placement.similarity.points(reconstruction.world_T_rigs[:, :3, 3])
     far = np.abs(placed).max(initial=0)
     scale = placement.similarity.scale
@@ -217,6 +222,26 @@ def _scale_by_lenses(
     return (scale, sigma), {"baseline_m": baseline[0], "scale_sigma": sigma}
 
 
+def _warn_of_lenses(
+    placement: Placement, reconstruction: Reconstruction, baseline: tuple[float, float] | None
+) -> None:
+    """Warn of a metric scale that contradicts the distance between the lenses, if that is known."""
+    if baseline is None or reconstruction.lens_baseline is None:
+        return
+    scale = placement.similarity.scale
+    lens, sigma = metres_per_unit(reconstruction.lens_baseline, baseline)
+    own = placement.grounds.get("gps", {}).get("scale_sigma", _MEASURED_SIGMA * scale) / scale
+    if abs(np.log(scale / lens)) > _MAX_SCALE_SIGMAS * np.hypot(own, sigma / lens):
+        logger.warning(
+            "the run is placed with %.4g m to a map unit, but the distance between its lenses "
+            "gives %.4g (sigma %.2g %%): check the length or positions that were given, and the "
+            "camera",
+            scale,
+            lens,
+            100 * sigma / lens,
+        )
+
+
 def _least_turn(source: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Smallest rotation (3, 3) that maps one unit vector to another."""
     axis, cosine = np.cross(source, target), float(source @ target)
@@ -233,7 +258,12 @@ def _least_turn(source: np.ndarray, target: np.ndarray) -> np.ndarray:
 def _point(text: str, reconstruction: Reconstruction, frames: FrameSet) -> np.ndarray:
     """Position (3,), run's world, of a frame by name or of "x,y,z"."""
     if text in frames.names:
-        return reconstruction.world_T_rigs[frames.names.index(text), :3, 3]
+        f = frames.names.index(text)
+        if reconstruction.pose_statuses[f] != PoseStatus.REFINED:
+            raise GsbaError(
+                f"--between {brief(text)}: its pose was not refined: choose another frame"
+            )
+        return reconstruction.world_T_rigs[f, :3, 3]
     try:
         point = np.array([float(part) for part in text.split(",")])
     except ValueError:
@@ -275,6 +305,16 @@ def _on_earth(
         raise GsbaError(
             f"{path}: the frames lie on a line, which determines no roll: add --up auto"
         )
+    good = reconstruction.pose_statuses == PoseStatus.REFINED
+    times, everywhere = frames.timestamps[good], reconstruction.world_T_rigs[good, :3, 3]
+    lag = lag_of(fixes, times, everywhere @ level.T, level=up_sigma is not None)
+    if lag:
+        fixes, positions = _moved(path, fixes, lag, times, everywhere)
+    if up_sigma is not None and are_mirrored(fixes, positions @ level.T):
+        raise GsbaError(
+            f"{path}: its positions fit the mirror image of the run better: in the file, latitude "
+            "and longitude are swapped, or the sign of one of them is missing"
+        )
     with naming(path):
         found = fit_fixes(positions @ level.T, fixes, up_sigma, scale)
     off = residuals_of(found.similarity, positions @ level.T, fixes.positions)
@@ -301,7 +341,7 @@ def _on_earth(
             "refuses such positions",
             path,
         )
-    sigmas = found.position_sigmas(positions @ level.T)
+    sigmas = found.position_sigmas(everywhere @ level.T)  # also where there are no fixes
     grounds = {
         **upright.grounds,
         "gps": {
@@ -314,12 +354,14 @@ def _on_earth(
             "heading_sigma_deg": float(np.degrees(found.heading_sigma)),
             "tilt_sigma_deg": float(np.degrees(found.tilt_sigma)),
             "position_sigma_m": np.median(sigmas, axis=0).tolist(),  # east, north and up
+            "largest_position_sigma_m": sigmas.max(axis=0).tolist(),
+            "lag_s": lag,  # by which fixes are behind their frames
         },
     }
     logger.info(
         "--gps %s: %d of %d positions are inliers, with an RMS residual of %.3g m, at latitude "
         "%.5f, longitude %.5f; sigmas: scale %.2g %%, heading %.2g degrees, tilt %.2g degrees, "
-        "position %.2g m",
+        "position %.2g m, at most %.2g m",
         path,
         found.used.sum(),
         len(fixes),
@@ -328,10 +370,28 @@ def _on_earth(
         100 * found.scale_sigma,
         np.degrees(found.heading_sigma),
         np.degrees(found.tilt_sigma),
-        grounds["gps"]["position_sigma_m"][0],
+        np.median(sigmas[:, 0]),
+        sigmas[:, 0].max(),
     )
     where = (float(fixes.origin[0]), float(fixes.origin[1]), float(fixes.origin[2]))
     return Placement(fit, unit="m", up="z", origin=where, grounds=grounds)
+
+
+def _moved(
+    path: Path, fixes: FrameFixes, lag: float, times: np.ndarray, positions: np.ndarray
+) -> tuple[FrameFixes, np.ndarray]:
+    """Fixes that are behind their frames by a lag, seconds, and the run's positions (G, 3) there;
+    times (F,) and positions (F, 3) are of all refined frames."""
+    assert fixes.times is not None  # lags are seconds
+    logger.warning(
+        "--gps %s: its positions are %.2f s %s the frames by the shapes of both paths; they were "
+        "moved by that: if it is wrong, check the file's times",
+        path,
+        abs(lag),
+        "behind" if lag > 0 else "ahead of",
+    )
+    at, known = positions_at(fixes.times - lag, times, positions)
+    return fixes.taken(known), at[known]
 
 
 def _require_majority(

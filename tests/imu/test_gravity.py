@@ -45,3 +45,13 @@ def test_up_is_found(known: Alignment, forces: np.ndarray, most_deg: float) -> N
 def test_no_accelerometer_and_none_that_shows_weight(known: Alignment) -> None:
     assert _up(known, None) is None
     assert _up(known, 0.01 * READINGS.forces) is None
+
+
+@pytest.mark.parametrize("axes", [[1, 0, 2], [2, 0, 1], [0, 2, 1]])
+def test_an_accelerometer_with_other_axes_than_the_gyro_is_refused(
+    known: Alignment, caplog: pytest.LogCaptureFixture, axes: list[int]
+) -> None:
+    """The vertical was 80 to 120 degrees off."""
+    forces = (READINGS.forces @ IMU_R_RIG)[:, axes] @ IMU_R_RIG.T
+    assert _up(known, forces) is None
+    assert "check that its axes are those of the gyro" in caplog.text

@@ -73,6 +73,22 @@ def test_fixes_by_name_stay_with_a_recording_that_others_are_added_to(tmp_path: 
         assert found.tolist() == list(range(first, first + 4))
 
 
+@pytest.mark.parametrize("begin", [0.0, 1.7e9])
+def test_times_from_the_start_of_a_recording_are_not_those_of_another(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, begin: float
+) -> None:
+    """They placed frames of both; two cameras that show Unix time were carried along together."""
+    one = replace(frame_set(4), timestamps=begin + 0.5 * np.arange(4))
+    paths = tuple((Path(f"other{n}"),) for n in range(5))
+    other = replace(frame_set(5), timestamps=begin + 0.5 * np.arange(5), paths=paths)
+    both, path = combine({"one": one, "other": other}), tmp_path / "gps.csv"
+    rows = [f"{begin + 0.5 * n},48.000{n},11,500" for n in range(4)]
+    path.write_text("\n".join(["timestamp,latitude,longitude,altitude", *rows]))
+    found = fixes_of_frames(str(path), both).frames.tolist()
+    assert found == [0, 1, 2, 3, *(range(4, 8) if begin else [])]
+    assert ("not of 'other', whose clock shows the same" in caplog.text) == (begin == 0)
+
+
 def test_altitudes_are_all_or_none() -> None:
     geodetic = np.array([[48, 11, np.nan], [48, 11, 500.0], [48, 11, 501], [48, 11, 502]])
     some = fixes_of([3.0, 1, 2, 0], geodetic)
@@ -204,6 +220,18 @@ def test_fixes_of_insta360_are_on_the_clock_of_the_video(tmp_path: Path) -> None
         np.testing.assert_allclose(found.geodetic, [[-10.5, 20.25, 12.0]] * 3)
     path.write_bytes(b"pictures" + insta360_files.trailer(records[1:]))
     refused("holds no GPS", read_video_gps, path)
+
+
+def test_the_offset_of_a_clock_counts_in_videos_and_never_for_names(tmp_path: Path) -> None:
+    path, late = tmp_path / "VID_20240101_120000_00_001.insv", GpsSettings(offset_s=-2.5)
+    fixes = b"".join(insta360_files.fix(1_700_000_000 + n, -10.5, 20.25) for n in range(3))
+    path.write_bytes(b"pictures" + insta360_files.trailer([(0, insta360_files.GPS, fixes)]))
+    found = read_fixes(str(path), None, late)
+    assert found is not None and found.timestamps is not None
+    np.testing.assert_allclose(found.timestamps, np.arange(3) - 2.5)
+    names = tmp_path / "names.csv"
+    names.write_text("name,lat,lon\na,48,11\nb,48,11.001\nc,48,11.002\n")
+    refused("--gps-offset -2.5 is added to times", read_fixes, str(names), None, late)
 
 
 def test_points_of_a_gpx_track_that_share_seconds_are_spread(tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ from gsba.placement.gps import local_from_geodetic, read_gps
 from gsba.placement.placement import Placement, place
 from gsba.similarity import Sim3, level_similarity, residuals_of, robust_similarity, similarity
 from gsba.trajectory.files import read_trajectory, write_tum
-from gsba.types import FrameSet, PictureFormat, Trajectory
+from gsba.types import FrameSet, PictureFormat, PoseStatus, Trajectory
 
 
 def test_local_metres_of_known_places() -> None:
@@ -94,6 +94,28 @@ def test_scale_between_frames_or_points() -> None:
     assert placed.unit == "m" and placed.similarity.scale == pytest.approx(1 / 0.21, rel=1e-12)
     placed = place(result, frames, PlacementSettings(length=5.0, between=("0,0,0", "0,0.5,0")))
     assert placed.similarity.scale == pytest.approx(10)
+
+
+def test_a_length_that_is_wrong_by_ten_is_told_by_the_lenses(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    frames = frame_set(40)
+    result = dataclasses.replace(walk_result(), lens_baseline=(0.032 * 0.21, 0.0003))
+    ends = level_metres(walk_result())[[2, 30]]
+    true = float(np.linalg.norm(ends[1] - ends[0]))
+    for wrong in (1.0, 10.0):
+        settings = PlacementSettings(length=wrong * true, between=("frame_0002", "frame_0030"))
+        placed = place(result, frames, settings, (0.032, 0.001))
+        assert placed.similarity.scale == pytest.approx(wrong / 0.21)
+        told = "but the distance between its lenses gives 4.762" in caplog.text
+        assert told == (wrong > 1)
+
+
+def test_lengths_are_between_refined_frames() -> None:
+    result = walk_result()
+    result.pose_statuses[30] = PoseStatus.UNREFINED
+    settings = PlacementSettings(length=2.0, between=("frame_0002", "frame_0030"))
+    refused("frame_0030: its pose was not refined", place, result, frame_set(40), settings)
 
 
 def test_scale_by_the_distance_between_lenses() -> None:
