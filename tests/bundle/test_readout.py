@@ -9,11 +9,15 @@ from scipy.spatial.transform import Rotation
 from synthetic import World, loop_walk
 
 from gsba.bundle import readout
+from gsba.bundle.found_camera import FoundCamera
+from gsba.bundle.lens_centres import LensCentres
 from gsba.bundle.readout import CameraEstimate
 from gsba.bundle.shared_parameters import ObservedRays
 from gsba.camera.lens import Lenses
+from gsba.config import CameraSettings
 from gsba.geometry import pose
-from gsba.types import Fisheye, Keypoints, Solution
+from gsba.report.camera_findings import of_camera
+from gsba.types import Counts, Fisheye, Keypoints, Solution
 
 FISHEYE = Fisheye(960, 960, 300.0, (480.0, 480.0), (0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 
@@ -205,3 +209,13 @@ def test_lenses_of_two_instants_are_no_readout(seed: int) -> None:
     _, _, found = _of_few(world, replace(shown, bearings_rig=bearings))
     assert found.reason == readout.TWO_INSTANTS
     assert found.lenses.row_directions is None and found.lenses.readout_motion is None
+
+
+def test_the_report_warns_of_two_instants() -> None:
+    centres = LensCentres(
+        LENSES, LENSES.centre, np.eye(3) * 1e-6, np.zeros(4), "", Counts(9, 9, "")
+    )
+    seen = CameraEstimate(LENSES, reason=readout.TWO_INSTANTS)
+    for one, warned in ((seen, True), (replace(seen, reason="too few points"), False)):
+        _, notes = of_camera(FoundCamera(centres, readout=one), None, 1.0, CameraSettings(), True)
+        assert any(readout.TWO_INSTANTS in note for note in notes) == warned
