@@ -3,7 +3,7 @@
 # record in the dark, goes about to the time n / mean rate, not to frame n; `get` reports that it is at n.
 # Expected: the frame that n calls of read() come to, as at a constant rate. Seen of 60 frames at 30 and
 # 60 at 15 frames per second: 93 of 120 are others, 50 is frame 66, up to 20 frames (1.33 s) away, and
-# there is no picture for the last eight. Poses that were computed of frames read in turn are those of other pictures
+# there is no picture for the last eight. Poses of frames that were read in turn belong to other pictures
 # as soon as the pictures are fetched by number.
 set -euo pipefail
 work=$(mktemp -d)
