@@ -28,7 +28,7 @@ for degrees in (80.0, 89.9, 90.1, 95.0, 100.0):
     true = MIDDLE + FOCAL * angle
     tangent = cv2.fisheye.undistortPoints(np.array([[[true, MIDDLE]]]), camera, plain)[0, 0, 0]
     back = np.degrees(np.arctan(tangent))
-    print(f"{degrees} degrees: column {true:.1f}, projected to {column:.1f}, undistorted to {back:.1f} degrees")
+    print(f"{degrees} degrees, column {true:.1f}: projected to {column:.1f}, undistorted to {back:.1f}")
     if degrees < 90:
         assert np.isclose(column, true) and np.isclose(back, degrees), (column, back)
     else:
@@ -55,11 +55,11 @@ def poses(field_of_view):
 
 for field_of_view in (178, 190):
     errors, past = poses(field_of_view)
-    print(f"lens of {field_of_view} degrees, {past:.0%} of the points past 90: poses off by (least, half, most)",
+    print(f"lens of {field_of_view} degrees, {past:.0%} of points past 90: poses off by (least, half, most)",
           *(f"{np.array2string(np.percentile(part, [0, 50, 100]), precision=1)} {unit}"
             for part, unit in zip(errors.T, ("degrees", "m"))))
     if field_of_view < 180:
         assert errors.max() < 1e-6, errors
     else:
-        assert (errors[:, 1] > 1).all() and np.median(errors[:, 0]) > 30, errors
+        assert (errors[:, 1] > 1).mean() > 0.9 and np.median(errors[:, 0]) > 30, errors
 PROGRAM

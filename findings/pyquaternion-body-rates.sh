@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
 # pyquaternion 0.9.9, `Quaternion.integrate` and `derivative`: the rates are documented to be "about the
 # global x, y and z axes respectively", and are taken about the axes of the body itself, which is what a
-# gyroscope measures. Who follows the documentation and turns the gyro's rates into the world first, or
-# has rates about the world's axes, gets another rotation, without a sign.
+# gyroscope measures. Rates about the world's axes, or a gyroscope's turned into the world first as the
+# documentation asks for, give another rotation, without a warning.
 # Expected of one second at a constant rate about the world's axes from heading 40, pitch 20, roll 10
 # degrees: the rotation of that vector times the start, as numpy-quaternion integrates it.
 # Seen: the start times that rotation, 68 degrees away; from the identity both are the same.
@@ -10,7 +10,8 @@ set -euo pipefail
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
 python3 -m venv "$work/venv"
-"$work/venv/bin/pip" install --quiet pyquaternion==0.9.9 numpy-quaternion==2024.0.13 numpy==2.4.6 scipy==1.17.1
+"$work/venv/bin/pip" install --quiet pyquaternion==0.9.9 numpy-quaternion==2024.0.13 numpy==2.4.6 \
+  scipy==1.17.1
 "$work/venv/bin/python" - <<'PROGRAM'
 import numpy as np
 import quaternion
@@ -39,9 +40,9 @@ for angles in ([0, 0, 0], [40, 20, 10]):
     _, others = quaternion.integrate_angular_velocity(
         lambda time, rotor: RATE, 0, 1, R0=quaternion.quaternion(w, x, y, z))
     other = Rotation.from_matrix(quaternion.as_rotation_matrix(others[-1]))
-    print(f"from {angles} degrees, off from rates about the world's axes by {off_by(turned, world):.2f}, about "
-          f"the body's by {off_by(turned, body):.2f} degrees; numpy-quaternion by {off_by(other, world):.2f} "
-          f"and {off_by(other, body):.2f}")
+    print(f"from {angles} degrees, off from rates about the axes of the world and of the body: pyquaternion "
+          f"{off_by(turned, world):.2f} and {off_by(turned, body):.2f} degrees, numpy-quaternion "
+          f"{off_by(other, world):.2f} and {off_by(other, body):.2f}")
     assert np.allclose(slope, (0.5 * Quaternion(pure) * Quaternion(w, x, y, z)).elements), slope
     assert off_by(turned, body) < 1e-6 and off_by(other, world) < 1e-6
     assert off_by(turned, world) > 60 if any(angles) else off_by(turned, world) < 1e-6

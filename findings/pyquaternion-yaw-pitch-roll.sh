@@ -25,7 +25,8 @@ for yaw, pitch, roll in ((40, 0, 0), (40, 20, 10), (40, 80, 10)):
     rotation = Rotation.from_matrix(turned.rotation_matrix)
     by_scipy = rotation.as_euler("ZYX", degrees=True)
     seen = np.degrees(turned.yaw_pitch_roll)
-    print(f"heading, pitch, roll {yaw, pitch, roll}: SciPy {by_scipy.round(1)}, pyquaternion {seen.round(1)}")
+    print(f"heading, pitch, roll {yaw, pitch, roll}: SciPy {by_scipy.round(1)}, "
+          f"pyquaternion {seen.round(1)}")
     assert np.allclose(by_scipy, [yaw, pitch, roll])
     assert np.allclose(seen, rotation.as_euler("XYZ", degrees=True)[::-1]), seen
     assert np.allclose(seen, by_scipy) == (pitch == 0), seen
