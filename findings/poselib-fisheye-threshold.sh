@@ -3,7 +3,7 @@
 # the focal length and compared with distances in the plane at z = 1. There a pixel is the longer the
 # farther it is from the axis, 15 times along the radius at 75 degrees: the nearer the edge, the fewer
 # good observations pass. Inlier ratios and the list of inliers lack them.
-# Expected of 500 exact pairs with noise of half a pixel and a threshold of 2: all are inliers, as nearly
+# Expected of 500 right pairs with noise of half a pixel and a threshold of 2: all are inliers, as nearly
 # all are of the same data to COLMAP, and by their residuals to the very pose that PoseLib returns.
 # Seen: 100 % within 30 degrees from the axis, 91 % within 60, 75 % within 75, 58 % within 89.
 set -euo pipefail

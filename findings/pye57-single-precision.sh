@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
 # pye57 0.4.19, `write_scan_raw`: coordinates, given as doubles, are written to E57 in single precision,
 # whatever they are; there is no parameter for it. A survey's coordinates (UTM, metres) keep steps of .5 m
-# to the north and 3 cm to the east. The limits in the scan's header stay doubles, and readers return
-# doubles. (A scan near its own origin with its place as `translation` keeps its millimetres.)
+# to the north and 3 cm to the east, though what is read back are doubles again. (A scan near its own
+# origin with its place as `translation` keeps its millimetres.)
 # Expected of a flat wall of points a centimetre apart at UTM coordinates: the same. Seen: northings
 # off by up to .25 m, 201 of them become 5, without a warning; with the place as translation .06 um.
 set -euo pipefail
