@@ -43,6 +43,7 @@ _MAX_SCALE_SIGMAS = 4.0  # of two scales that agree: true ones differ by more on
 _MEASURED_SIGMA = 0.02  # relative, of a scale by a tape measure
 _NUM_NAMED = 5  # false positions that a message names
 _UPSIDE_DOWN = -0.5  # vertical component of the cameras' up axes: 120 degrees from up
+_MAX_LEAN_DEG = 30.0  # from up, of the cameras' mean up axis: people hold them upright
 _MIN_EXTENT_RATIO = 0.02  # of a path's second extent to its first: less determines no roll
 
 
@@ -341,6 +342,8 @@ def _on_earth(
             "refuses such positions",
             path,
         )
+    elif up_sigma is None:
+        _warn_of_lean(path, ups, float(np.degrees(found.tilt_sigma)))
     sigmas = found.position_sigmas(everywhere @ level.T)  # also where there are no fixes
     grounds = {
         **upright.grounds,
@@ -375,6 +378,20 @@ def _on_earth(
     )
     where = (float(fixes.origin[0]), float(fixes.origin[1]), float(fixes.origin[2]))
     return Placement(fit, unit="m", up="z", origin=where, grounds=grounds)
+
+
+def _warn_of_lean(path: Path, ups: np.ndarray, tilt_sigma_deg: float) -> None:
+    """Warn where cameras whose up axes (G, 3), placed, are alike lean much more than the tilt is
+    uncertain by: altitudes that jump or drift tilt a run."""
+    held = ups.mean(axis=0)
+    lean = float(np.degrees(np.arctan2(np.hypot(held[0], held[1]), held[2])))
+    if np.linalg.norm(held) > 0.9 and lean > max(_MAX_LEAN_DEG, 3 * tilt_sigma_deg):
+        logger.warning(
+            "--gps %s: as its positions place the run, the cameras lean by %.0f degrees: unless "
+            "they were held so, its altitudes are wrong: add --up auto",
+            path,
+            lean,
+        )
 
 
 def _moved(

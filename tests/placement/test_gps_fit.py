@@ -198,6 +198,24 @@ def test_swapped_columns_turn_the_run_upside_down(
     assert "the placed run is upside down" in caplog.text
 
 
+def test_altitudes_that_jump_tilt_the_run(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, upright: PlacementSettings
+) -> None:
+    """By more than its sigma promises: how the camera was held tells."""
+    frames, true = frame_set(40), _walk(40, 80.0)
+    result = _result(true @ Y_DOWN)
+    result.world_T_rigs[:, :3, :3] = np.eye(3)
+    jumped = true + np.outer(np.arange(40) > 24, [0, 0, 47.0])
+    file = _table(tmp_path / "gps.csv", frames, jumped)
+    placed = place(result, frames, PlacementSettings(gps=file))
+    turned = placed.similarity.rotation @ Y_DOWN.T
+    assert np.degrees(np.arccos(turned[2, 2])) > 3 * placed.grounds["gps"]["tilt_sigma_deg"]
+    assert "the cameras lean by" in caplog.text
+    caplog.clear()
+    place(result, frames, upright.model_copy(update={"gps": file}))
+    assert not caplog.records
+
+
 def test_the_date_line_is_no_jump(tmp_path: Path, upright: PlacementSettings) -> None:
     frames, true = frame_set(40), _walk(40, 80.0)
     rows = ["name,lat,lon,alt"]
