@@ -26,6 +26,7 @@ def splat(
     iterations: int | None = None,
     backend: str = "auto",
     allow_partial: bool = False,
+    fresh: bool = False,
 ) -> None:
     """Make a splat of a video: refine, then train or export.
 
@@ -45,7 +46,7 @@ def splat(
         from gsba import pipeline
     with held_until_computing():
         out = out or run_folder(frames)
-        result = pipeline.refine(frames, None, out, settings)
+        result = pipeline.refine(frames, None, out, settings, fresh=fresh)
     if to is None:
         train_on(out, training)
         typer.echo(f"walk around in it: gsba view {out}")

@@ -78,6 +78,7 @@ OPTIONS = {  # PARAMETER, or COMMAND.PARAMETER where commands differ -> its help
         "Exit with 0 even if less than nine tenths of the frames are in one map, or the verdict on "
         "it is not to train."
     ),
+    "fresh": _option("Replace an earlier run."),
     "run": _argument("Folder of a finished run.", "RUN"),
     "iterations": _option("Training steps of one view each."),
     "face_size": _option("Width of a cube face in pixels."),
@@ -124,7 +125,6 @@ OPTIONS = {  # PARAMETER, or COMMAND.PARAMETER where commands differ -> its help
     ),
     "accept_noncommercial": _option("Use weights whose licence forbids commercial use."),
     "download": _option("Fetch missing weights from their authors."),
-    "refine.fresh": _option("Replace an earlier run."),
     # demo
     "demo.frames": _option("Frames of the walk; default: 40, of a video 240."),
     "demo.out": _option("Folder for the walk and its run."),

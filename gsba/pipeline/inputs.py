@@ -308,6 +308,7 @@ def _follow(
     stage = f"odometry@{name}" if name else "odometry"
 
     def compute() -> Odometry:
+        video.check_video(video_file, settings.video)
         panoramas = odometry.of_video(video_file, odometry.WIDTH, calibration, start, end)
         if masks.given is not None and masks.given.is_file():
             panoramas = odometry.masked(panoramas, masks.given)

@@ -40,6 +40,7 @@ from gsba.video.recording import (
     TRACKS,
     VideoPicture,
     VideoRecording,
+    advice_to_end_at,
     check_lengths,
     factory_calibration_of,
     files_of,
@@ -94,9 +95,7 @@ def extract(video: Path, out: Path, settings: VideoSettings, replace: bool = Fal
             f"--width {settings.width}: tracks of a .360 recording keep their size, as lenses "
             "overlap in a whole number of columns: leave it out"
         )
-    windows, received = _windows(video, recording, settings)
-    _check_end(video, recording, settings.to_s)
-    refuse_darkness(video, recording, [int(window[0]) for window in windows])
+    windows, received = _usable_windows(video, recording, settings)
     for note in recording.notes:
         logger.info("%s", note)
     _write_marker(out, video, key, None, recording.folders)
@@ -119,6 +118,21 @@ def extract(video: Path, out: Path, settings: VideoSettings, replace: bool = Fal
     dropped = ", ".join(f"{n} {reason}" for reason, n in counts.dropped.items() if n)
     logger.info("%s: kept %d of %d frames (%s)", out, counts.kept, received, dropped or "all")
     return counts
+
+
+def check_video(video: Path, settings: VideoSettings) -> None:
+    """Refuse a video that `extract` refuses, truncated or black, before hours of other work."""
+    _usable_windows(video, read_recording(video), settings)
+
+
+def _usable_windows(
+    video: Path, recording: VideoRecording, settings: VideoSettings
+) -> tuple[list[np.ndarray], int]:
+    """`_windows` of a video that is neither truncated nor black."""
+    windows, received = _windows(video, recording, settings)
+    _check_end(video, recording, settings.to_s)
+    refuse_darkness(video, recording, [int(window[0]) for window in windows])
+    return windows, received
 
 
 def refuse_darkness(video: Path, recording: VideoRecording, instants: Sequence[int]) -> None:
@@ -184,7 +198,7 @@ def _check_end(video: Path, recording: VideoRecording, to_s: float | None) -> No
         claimed = recording.timelines[0].claimed_s
         raise GsbaError(
             f"{video} claims to last {claimed:.1f} s, but its frames end at {last:.3f} s: it is "
-            f"truncated; copy it again, or pass --to {last:.3f} to use the part that exists"
+            f"truncated; copy it again, or {advice_to_end_at(last)} to use the part that exists"
         )
 
 

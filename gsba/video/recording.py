@@ -200,9 +200,14 @@ def check_lengths(recording: VideoRecording) -> None:
         ours, theirs = f"the {LENSES[short]} lens's pictures", f"the {LENSES[long]} one's"
     raise GsbaError(
         f"{recording.tracks[short].path}: {ours} last {lasting[short]:.3f} s, {theirs} "
-        f"{lasting[long]:.3f} s: one is truncated; copy it again, or pass --to {end:.3f} to use "
-        "the part of both"
+        f"{lasting[long]:.3f} s: one is truncated; copy it again, or {advice_to_end_at(end)} to "
+        "use the part of both"
     )
+
+
+def advice_to_end_at(end_s: float) -> str:
+    """Options by which commands end a video at a time, seconds."""
+    return f"pass --to {end_s:.3f} (refine, splat: --set video.to_s={end_s:.3f})"
 
 
 def _is_nearly_square(size: tuple[int, int]) -> bool:

@@ -20,8 +20,10 @@ def test_splat_writes_a_trainers_dataset(
     """`splat` refines, then exports; a world without a vertical goes out as it is."""
     run, called = case.copy(tmp_path / "run"), []
 
-    def refine(frames: Path, trajectory: None, out: Path, settings: RefineSettings) -> RunResult:
-        called.append((frames, trajectory, out, settings))
+    def refine(
+        frames: Path, trajectory: None, out: Path, settings: RefineSettings, fresh: bool
+    ) -> RunResult:
+        called.append((frames, trajectory, out, settings, fresh))
         return case.result
 
     def no_vertical(*given: object) -> None:
@@ -31,8 +33,9 @@ def test_splat_writes_a_trainers_dataset(
     if not upright:
         monkeypatch.setattr("gsba.placement.placement.place", no_vertical)
     options = ("--out", run, "--to", "brush", "--config", "fast", "--face-size", 64)
+    options += () if upright else ("--fresh",)
     done = succeed("splat", tmp_path / "walk.mp4", *options)
-    assert called == [(tmp_path / "walk.mp4", None, run, load_config(Path("fast")))]
+    assert called == [(tmp_path / "walk.mp4", None, run, load_config(Path("fast")), not upright)]
     assert f"brush: brush {run / 'brush'}" in done.output
     assert (run / "brush/sparse/0/images.bin").is_file()
     place = json.loads((run / "brush/transform.json").read_text())

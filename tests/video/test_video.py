@@ -301,6 +301,20 @@ def test_a_truncated_video_says_how_far_it_goes(film: Path, tmp_path: Path) -> N
     end = result.stderr.split("--to ")[1].split()[0]
     assert run_gsba("extract", cut, "--out", tmp_path / "f", "--to", end).exit_code == 0
     assert 0 in _indices(tmp_path / "f")
+    assert f"(refine, splat: --set video.to_s={end})" in result.stderr
+
+
+def test_a_black_video_is_refused_before_it_is_followed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def never(*given: object) -> None:
+        raise AssertionError("followed")
+
+    monkeypatch.setattr("gsba.odometry.of_video", never)
+    black = [np.zeros((HEIGHT, WIDTH, 3), np.uint8)] * 8
+    video = encode(tmp_path / "v.mp4", (black, steady(8, NTSC)))
+    done = run_gsba("refine", video, "--out", tmp_path / "run")
+    assert done.exit_code == 1 and "its frames are black" in done.stderr, done.stderr
 
 
 def test_missing_library_is_one_line(
