@@ -207,7 +207,7 @@ def check_lengths(recording: VideoRecording) -> None:
 
 def advice_to_end_at(end_s: float) -> str:
     """Options by which commands end a video at a time, seconds."""
-    return f"pass --to {end_s:.3f} (refine, splat: --set video.to_s={end_s:.3f})"
+    return f"pass --to {end_s:.3f} (--set video.to_s={end_s:.3f} of refine and splat)"
 
 
 def _is_nearly_square(size: tuple[int, int]) -> bool:

@@ -301,7 +301,7 @@ def test_a_truncated_video_says_how_far_it_goes(film: Path, tmp_path: Path) -> N
     end = result.stderr.split("--to ")[1].split()[0]
     assert run_gsba("extract", cut, "--out", tmp_path / "f", "--to", end).exit_code == 0
     assert 0 in _indices(tmp_path / "f")
-    assert f"(refine, splat: --set video.to_s={end})" in result.stderr
+    assert f"(--set video.to_s={end} of refine and splat)" in result.stderr
 
 
 def test_a_black_video_is_refused_before_it_is_followed(
