@@ -38,7 +38,7 @@ OPTIONS = {  # PARAMETER, or COMMAND.PARAMETER where commands differ -> its help
     "out": _option("Folder of the run; default: named after the video, or FRAMES-run.", "RUN"),
     "recording": _option(
         "One of several recordings, with what belongs to it: name, trajectory, keyframes, masks, "
-        "timestamps, fps, calibration, imu, camera. Repeatable.",
+        "timestamps, fps, calibration, circles, imu, camera, odometry. Repeatable.",
         "PATH,KEY=VALUE,...",
     ),
     "no_trajectory": _option("Start from pairs of images, for a video without odometry, too."),
@@ -182,8 +182,8 @@ OPTIONS = {  # PARAMETER, or COMMAND.PARAMETER where commands differ -> its help
         "files|alpha|black",
     ),
     "export.gps": _option(
-        "GPS positions: CSV, GPX, a GoPro video, or exif (of the frames); export in metres east, "
-        "north, up.",
+        "GPS positions: CSV, GPX, a video of GoPro or Insta360, or exif (of the frames); export in "
+        "metres east, north, up.",
         "FILE",
     ),
     "export.images": _option(

@@ -289,7 +289,8 @@ def _against_scan(run: Path, path: Path, known: dict[str, str]) -> dict[str, Any
             f"{before} has {len(coarse)} poses, the run {len(frames)} frames: refine again"
         )
     surfaces = read_scan(path)
-    guess, _ = guess_in_scan(reconstruction, frames, settings, surfaces)
+    noise = _gps_settings(run, None, None)
+    guess, _ = guess_in_scan(reconstruction, frames, settings, surfaces, noise)
     with in_file(path):
         errors = scan_errors(reconstruction, surfaces, coarse, guess)
     content = {"scan": str(path), "offset": surfaces.offset.tolist(), **errors.to_json()}

@@ -100,7 +100,7 @@ def _placement(
     if settings.scan is not None:
         path = Path(settings.scan)
         scan = read_scan(path)
-        guess, grounds = guess_in_scan(reconstruction, frames, settings, scan)
+        guess, grounds = guess_in_scan(reconstruction, frames, settings, scan, gps)
         with in_file(path):
             found = register(cloud_of(reconstruction, normals_of), scan, guess)
         logger.info("--align-scan %s: %s", path, found)
@@ -491,11 +491,15 @@ def _aligned(reconstruction: Reconstruction, frames: FrameSet, path: Path) -> Pl
 
 
 def guess_in_scan(
-    reconstruction: Reconstruction, frames: FrameSet, settings: PlacementSettings, scan: Scan
+    reconstruction: Reconstruction,
+    frames: FrameSet,
+    settings: PlacementSettings,
+    scan: Scan,
+    gps: GpsSettings | None = None,
 ) -> tuple[Guess, dict[str, Any]]:
     """Initial guess of a run's placement in a scan, in its world less its offset, by `pairs`, else
     `gps`, else `up`, and entries of transform.json on it. GsbaError if files cannot be used, or
-    frames have no common up axis."""
+    frames have no common up axis. `gps`: as of `place`."""
     axis = np.eye(3)["xyz".index(upwards(Path(settings.scan or "")))]
     if settings.pairs is not None:
         path = Path(settings.pairs)
@@ -508,7 +512,7 @@ def guess_in_scan(
         return guess.without(scan.offset), {"pairs": settings.pairs}
     if settings.gps is not None:
         upright = _upright(reconstruction, frames) if settings.up == "auto" else Placement()
-        earth = _on_earth(reconstruction, frames, settings.gps, upright)
+        earth = _on_earth(reconstruction, frames, settings.gps, upright, settings=gps)
         turn = _least_turn(np.array([0.0, 0, 1]), axis)
         rotation = turn @ earth.similarity.rotation
         return Guess(scale=earth.similarity.scale, rotation=rotation), earth.grounds

@@ -10,9 +10,10 @@ import pytest
 from plain_records import frames_of, map_of
 from scan_world import HALL, INTO_SCAN, SIZE, cloud, scan
 from synthetic import unit
+from walk_on_earth import frame_set, geodetic_of, level_metres, walk_result, write_fixes
 
 from gsba.cli import results
-from gsba.config import PlacementSettings
+from gsba.config import GpsSettings, PlacementSettings
 from gsba.evaluate import scans
 from gsba.evaluate.scans import format_scan, scan_errors
 from gsba.geometry import pose
@@ -81,6 +82,19 @@ def test_pairs_tell_where_to_look(tmp_path: Path) -> None:
     np.testing.assert_allclose(guess.similarity.translation, moved, atol=1e-9)
     nothing, _ = guess_in_scan(run, frames, PlacementSettings(scan="scan.ply"), far)
     assert nothing == Guess()
+
+
+def test_positions_that_start_the_fit_have_their_own_clock_and_noise(tmp_path: Path) -> None:
+    """As in a placement by GPS: the seconds to add to their times, the noise of the receiver."""
+    run, frames = walk_result(), frame_set(40)
+    late = write_fixes(
+        tmp_path / "late.csv", frames.timestamps + 1000, geodetic_of(level_metres(run))
+    )
+    known = PlacementSettings(scan="scan.ply", gps=str(late))
+    nothing = Scan(np.zeros((1, 3)), np.ones((1, 3)), np.zeros(3))
+    receiver = GpsSettings(offset_s=-1000.0, sigma_m=0.5, sigma_up_m=0.5)
+    guess, _ = guess_in_scan(run, frames, known, nothing, receiver)
+    assert guess.scale == pytest.approx(1 / 0.21, rel=1e-3)
 
 
 def test_a_scan_and_a_truth_are_both_in_the_json(
