@@ -1,11 +1,15 @@
 """Commands on footage: `extract`, `mask`, `track`."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import typer
 
 from gsba.cli.app import command
 from gsba.log import GsbaError
+
+if TYPE_CHECKING:
+    from gsba.config import VideoSettings
 
 
 @command
@@ -36,31 +40,44 @@ def extract(
         raise GsbaError(f"--to {to_s:g} must be later than --from {from_s:g}")
     if frames is not None and every != "auto":
         raise GsbaError("--frames needs --every auto: pass that, too")
-    if every == "auto":
-        every, at = None, _chosen_by_odometry(video, out, frames, fresh, (from_s, to_s))
-    options = {"fps": fps, "every": every, "at": None if at is None else str(at)}
-    options |= {"from_s": from_s, "to_s": to_s, "width": width}
+    if every == "auto" and sharpest:
+        raise GsbaError("--every auto keeps sharp frames already: leave out --sharpest")
+    options = {"fps": fps, "every": None if every == "auto" else every, "width": width}
+    options |= {"at": None if at is None else str(at), "from_s": from_s, "to_s": to_s}
     chosen = {key: value for key, value in options.items() if value is not None}
     chosen |= {"sharpest": sharpest} | ({"standing_deg": 0.0} if keep_standing else {})
-    counts = write(video, out, validated({"video": chosen}).video, fresh)
+    settings = validated({"video": chosen}).video
+    if every == "auto":
+        path = _chosen_by_odometry(video, out, frames, fresh, settings)
+        settings = settings.model_copy(update={"at": str(path)})
+    counts = write(video, out, settings, fresh)
     why = ", ".join(f"{n} {reason}" for reason, n in counts.dropped.items() if n)
     typer.echo(f"{counts.kept} of {counts.received} frames kept{f' ({why})' if why else ''}: {out}")
 
 
 def _chosen_by_odometry(
-    video: Path, out: Path, frames: int | None, fresh: bool, part: tuple[float | None, float | None]
+    video: Path, out: Path, frames: int | None, fresh: bool, video_settings: "VideoSettings"
 ) -> Path:
     """Trajectory file beside the folder of frames, with the poses of frames that odometry chose."""
     from gsba import odometry
     from gsba.config_file import validated
     from gsba.frames.files import EXTRACTED
     from gsba.odometry.walk import write_chosen
+    from gsba.trajectory.files import read_trajectory
+    from gsba.video import check_video
 
     path = out.with_name(f"{out.name}.tum")
-    if path.is_file() and (out / EXTRACTED).is_file() and not fresh:
-        return path  # chosen before
+    if path.is_file() and (out / EXTRACTED).is_file() and not fresh:  # chosen before
+        if frames is not None and len(read_trajectory(path).timestamps) > frames:
+            raise GsbaError(
+                f"{out} holds more than {frames} frames, chosen before: choose another --out, or "
+                "--fresh to replace it"
+            )
+        return path
     settings = validated({"odometry": {} if frames is None else {"max_frames": frames}}).odometry
-    panoramas = odometry.without_carrier(odometry.of_video(video, from_s=part[0], to_s=part[1]))
+    check_video(video, video_settings)
+    begin, end = video_settings.from_s, video_settings.to_s
+    panoramas = odometry.without_carrier(odometry.of_video(video, from_s=begin, to_s=end))
     found = odometry.track_panoramas(panoramas)
     if not found.usable():
         raise GsbaError(

@@ -86,7 +86,7 @@ def refine(
         out: folder of the run; a second call re-runs what depends on settings that changed.
         settings: see `gsba.config`.
         keyframes: trajectory file of the same run's keyframes: they lead.
-        masks: a file or a folder, "auto", "carrier", "distractors", "none", or several: see `merging.choose`.
+        masks: a file or a folder, "auto" and other words, or several: see `merging.choose`.
         segment: a command or a callable that masks faces; see `gsba.masks.segmentation.segmented`.
         timestamps: times of the frames (and of a KITTI trajectory's rows).
         fps: frames per second, where no file gives times; of a video: frames kept per second.

@@ -88,13 +88,6 @@ def extract(video: Path, out: Path, settings: VideoSettings, replace: bool = Fal
         logger.info("%s: %d frames, extracted before", out, done.kept)
         return done
     recording = read_recording(video)
-    if settings.width is not None and settings.width > recording.width:
-        raise GsbaError(f"--width {settings.width}: {video} has only {recording.width} pixels")
-    if settings.width is not None and recording.cube:
-        raise GsbaError(
-            f"--width {settings.width}: tracks of a .360 recording keep their size, as lenses "
-            "overlap in a whole number of columns: leave it out"
-        )
     windows, received = _usable_windows(video, recording, settings)
     for note in recording.notes:
         logger.info("%s", note)
@@ -121,14 +114,21 @@ def extract(video: Path, out: Path, settings: VideoSettings, replace: bool = Fal
 
 
 def check_video(video: Path, settings: VideoSettings) -> None:
-    """Refuse a video that `extract` refuses, truncated or black, before hours of other work."""
+    """Refuse a video that `extract` refuses, before hours of other work."""
     _usable_windows(video, read_recording(video), settings)
 
 
 def _usable_windows(
     video: Path, recording: VideoRecording, settings: VideoSettings
 ) -> tuple[list[np.ndarray], int]:
-    """`_windows` of a video that is neither truncated nor black."""
+    """`_windows` of a video that is neither truncated nor black, nor narrower than asked for."""
+    if settings.width is not None and settings.width > recording.width:
+        raise GsbaError(f"--width {settings.width}: {video} has only {recording.width} pixels")
+    if settings.width is not None and recording.cube:
+        raise GsbaError(
+            f"--width {settings.width}: tracks of a .360 recording keep their size, as lenses "
+            "overlap in a whole number of columns: leave it out"
+        )
     windows, received = _windows(video, recording, settings)
     _check_end(video, recording, settings.to_s)
     refuse_darkness(video, recording, [int(window[0]) for window in windows])

@@ -315,6 +315,19 @@ def test_a_black_video_is_refused_before_it_is_followed(
     video = encode(tmp_path / "v.mp4", (black, steady(8, NTSC)))
     done = run_gsba("refine", video, "--out", tmp_path / "run")
     assert done.exit_code == 1 and "its frames are black" in done.stderr, done.stderr
+    chosen = "extract", video, "--out", tmp_path / "frames", "--every", "auto"
+    fails(run_gsba(*chosen), "its frames are black")
+    fails(run_gsba(*chosen, "--width", 512), f"--width 512: {video} has only {WIDTH} pixels")
+    fails(run_gsba(*chosen, "--sharpest"), "--every auto keeps sharp frames already")
+
+
+def test_fewer_frames_than_chosen_before_are_another_extraction(film: Path, tmp_path: Path) -> None:
+    at, out = tmp_path / "frames.tum", tmp_path / "frames"
+    write_tum(at, Trajectory(np.arange(5) / 4, np.tile(np.eye(4), (5, 1, 1))))
+    succeed("extract", film, "--out", out, "--at", at)
+    again = "extract", film, "--out", out, "--every", "auto", "--frames"
+    succeed(*again, 5)
+    fails(run_gsba(*again, 4), "frames holds more than 4 frames, chosen before")
 
 
 def test_missing_library_is_one_line(
