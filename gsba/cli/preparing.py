@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from gsba.cli.app import command
+from gsba.cli.recordings import circle_of
 from gsba.log import GsbaError
 
 if TYPE_CHECKING:
@@ -122,10 +123,12 @@ def track(
     fps: float | None = None,
     timestamps: Path | None = None,
     calibration: Path | None = None,
+    circle: list[str] | None = None,
 ) -> None:
     """Estimate a pose for every frame by visual odometry."""
     from gsba import odometry
     from gsba.odometry.walk import write_odometry
+    from gsba.pipeline.inputs import given_circles
     from gsba.video import is_video
 
     if out.is_dir():
@@ -133,16 +136,17 @@ def track(
     if width % 2:
         raise GsbaError(f"--width {width}: use an even number")
     mask = None if masks in ("auto", "none") else Path(masks)
+    circles = given_circles([circle_of(text) for text in circle or ()], calibration)
     if is_video(frames):
         if fps is not None or timestamps is not None:
             raise GsbaError(
                 "a video holds the times of its frames: leave out --fps and --timestamps"
             )
-        panoramas = odometry.of_video(frames, width, calibration)
+        panoramas = odometry.of_video(frames, width, calibration, circles=circles)
     else:
         from gsba.frames.scan import scan
 
-        found = scan(frames, timestamps, fps, None, order_suffices=True, calibration=calibration)
+        found = scan(frames, timestamps, fps, None, True, calibration, circles)
         panoramas = odometry.of_frames(found, frames, width)
     if mask is not None:
         panoramas = odometry.masked(panoramas, mask)

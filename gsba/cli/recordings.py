@@ -19,6 +19,17 @@ _KEYS = ("name", "camera", "fps", "odometry", "circles", *_SEVERAL, *_PATHS)
 _MASK_WORDS = ("auto", "carrier", "distractors", "none")
 
 
+def circle_of(text: str) -> tuple[float, float, float]:
+    """Centre and radius of `--circle X,Y,R`."""
+    try:
+        x, y, radius = (float(part) for part in text.split(","))
+    except ValueError:
+        raise GsbaError(
+            f"--circle {text}: give a centre and a radius as three numbers X,Y,R"
+        ) from None
+    return x, y, radius
+
+
 def grouped(given: Sequence[Path]) -> list[tuple[Path, list[Path]]]:
     """Folders and videos of recordings, each with the trajectory files that follow it."""
     from gsba.video import is_video

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from gsba.cli.app import command, loading
-from gsba.cli.recordings import grouped, recordings_of
+from gsba.cli.recordings import circle_of, grouped, recordings_of
 from gsba.log import GsbaError, held_until_computing
 
 if TYPE_CHECKING:
@@ -77,7 +77,7 @@ def refine(
     settings = settings_of(config, overrides, factors)
     shared: dict[str, Any] = {"odometry": False if no_trajectory else None, "fps": fps}
     shared |= {"masks": masks or "auto", "calibration": calibration}
-    shared["circles"] = [_circle(text) for text in circle or ()]
+    shared["circles"] = [circle_of(text) for text in circle or ()]
     own: dict[str, Any] = {"keyframes": keyframes, "timestamps": timestamps, "imu": imu}
     with held_until_computing(), connected(cluster) as client:
         run: dict[str, Any] = {"segment": segment, "fresh": fresh, "client": client}
@@ -247,17 +247,6 @@ def show_config(
     from gsba.config_file import to_toml
 
     typer.echo(to_toml(settings_of(config, overrides, factors)), nl=False)
-
-
-def _circle(text: str) -> tuple[float, float, float]:
-    """Centre and radius of `--circle X,Y,R`."""
-    try:
-        x, y, radius = (float(part) for part in text.split(","))
-    except ValueError:
-        raise GsbaError(
-            f"--circle {text}: give a centre and a radius as three numbers X,Y,R"
-        ) from None
-    return x, y, radius
 
 
 def _networks(weights: list[Path] | None, accept_noncommercial: bool, download: bool) -> list[str]:

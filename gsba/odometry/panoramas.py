@@ -15,6 +15,7 @@ from gsba.camera.fisheye import Rig
 from gsba.disk import write_image
 from gsba.frames.dual_fisheye import clear_of_seam, join_pictures, width_of
 from gsba.frames.factory_start import starting_lenses
+from gsba.frames.image_circles import ImageCircle
 from gsba.frames.masks import load_mask
 from gsba.frames.pixels import load_erp
 from gsba.frames.raw_pairs import lenses_of
@@ -85,10 +86,12 @@ def of_video(
     calibration: Path | None = None,
     from_s: float | None = None,
     to_s: float | None = None,
+    circles: Sequence[ImageCircle] = (),
 ) -> SmallPanoramas:
-    """Panoramas of a video: stitched, or raw and joined by its lenses' calibration file, None =
-    from image circles or the maker's file. They are `width` pixels across, less if the video is
-    smaller, from `from_s` to `to_s` seconds since its first frame; None = all.
+    """Panoramas of a video: stitched, or raw and joined by its lenses' calibration file, None = by
+    `circles` as of `frames.scan`, the maker's file, or circles found. They are `width` pixels
+    across, less if the video is smaller, from `from_s` to `to_s` seconds since its first frame;
+    None = all.
 
     Raises:
         GsbaError: no such video, fewer than three frames, or a raw one without image circles.
@@ -107,7 +110,7 @@ def of_video(
     widest = 4 * recording.width // 3 if recording.cube else recording.width
     width = min(width, widest * (2 if recording.lenses else 1)) // 2 * 2
     size = (width, width // 2)
-    pair = _lenses(recording, rows, calibration) if recording.lenses else None
+    pair = _lenses(recording, rows, calibration, circles) if recording.lenses else None
     share = 1.0 if pair is None else width / width_of(pair)
     usable = None if pair is None else clear_of_seam(width // 2, pair)
 
@@ -161,7 +164,12 @@ def _narrowed(panoramas: SmallPanoramas, usable: np.ndarray) -> SmallPanoramas:
     return replace(panoramas, usable=fitted if before is None else fitted & before)
 
 
-def _lenses(recording: VideoRecording, rows: np.ndarray, calibration: Path | None) -> Rig:
+def _lenses(
+    recording: VideoRecording,
+    rows: np.ndarray,
+    calibration: Path | None,
+    circles: Sequence[ImageCircle],
+) -> Rig:
     """Initial lenses of a raw recording, from a few of its frames."""
     looks = rows_across(len(rows), 8)
     size = (recording.width, recording.width)
@@ -174,11 +182,12 @@ def _lenses(recording: VideoRecording, rows: np.ndarray, calibration: Path | Non
                 write_image(path, picture.luma())
             pairs.append(pair)
             size = pictures[0].luma().shape[::-1]
-        factory = factory_calibration_of(recording) if calibration is None else None
+        nothing_given = calibration is None and not circles
+        factory = factory_calibration_of(recording) if nothing_given else None
         try:
             if factory is not None:
                 return starting_lenses(Path(name), pairs, size, parse_factory_lenses(factory))
-            return lenses_of(Path(name), pairs, size, calibration)[0]
+            return lenses_of(Path(name), pairs, size, calibration, circles)[0]
         except GsbaError as error:
             where = str(recording.tracks[0].path)
             raise GsbaError(str(error).replace(name, where)) from None

@@ -251,6 +251,7 @@ def extract_video(
     fps: float | None,
     by_odometry: Choice | None = None,
     calibration: Path | None = None,
+    circles: Sequence[ImageCircle] = (),
     name: str = "",
 ) -> Odometry | None:
     """Write the frames of a video to `frames` in the run's folder.
@@ -259,7 +260,7 @@ def extract_video(
         fps: frames kept per second; None = as the settings say.
         by_odometry: choose the frames by what the video's own odometry shows under these masks;
             None = by the settings.
-        calibration: of the lenses of a raw video, for the odometry.
+        calibration, circles: of the lenses of a raw video, for the odometry.
         name: of one of several recordings, whose frames go to `frames`/`name`; "" = the only one.
 
     Returns:
@@ -272,7 +273,7 @@ def extract_video(
     found: Odometry | None = None
     if by_odometry is not None:
         tell_size(settings, None, track_sizes(video_file)[0][0], False)
-        found = _follow(store, video_file, settings, by_odometry, calibration, name)
+        found = _follow(store, video_file, settings, by_odometry, calibration, circles, name)
         if found.usable():
             rows = odometry.choose_frames(found, settings.odometry)
             logger.info("%d of %d frames chosen by what they show", len(rows), len(found))
@@ -300,6 +301,7 @@ def _follow(
     settings: RefineSettings,
     masks: Choice,
     calibration: Path | None,
+    circles: Sequence[ImageCircle],
     name: str,
 ) -> Odometry:
     """Odometry of a video."""
@@ -309,7 +311,7 @@ def _follow(
 
     def compute() -> Odometry:
         video.check_video(video_file, settings.video)
-        panoramas = odometry.of_video(video_file, odometry.WIDTH, calibration, start, end)
+        panoramas = odometry.of_video(video_file, odometry.WIDTH, calibration, start, end, circles)
         if masks.given is not None and masks.given.is_file():
             panoramas = odometry.masked(panoramas, masks.given)
         if masks.carrier:
@@ -318,5 +320,5 @@ def _follow(
         return odometry.track_panoramas(panoramas, seed, checkpoint=unfinished)
 
     files = fingerprint([*files_of(video_file), calibration, masks.given])
-    key = [odometry.WIDTH, seed, (start, end), masks.carrier, files]
+    key = [odometry.WIDTH, seed, (start, end), masks.carrier, files, *map(repr, circles)]
     return store.stage(stage, key, compute, Odometry)

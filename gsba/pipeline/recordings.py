@@ -155,9 +155,11 @@ def _extracted(one: GivenRecording, store: RunStore, settings: RefineSettings) -
     recording = one.recording
     followed = inputs.follows(settings.video, recording.fps, recording.odometry, one.trajectories)
     chosen = merging.choose(recording.masks) if followed else None
-    given = one.folder, settings, recording.fps, chosen, _path(recording.calibration), one.name
+    calibration = _path(recording.calibration)
     with naming_recording(one.name):
-        walk = inputs.extract_video(store, *given)
+        circles = inputs.given_circles(recording.circles, calibration)
+        lenses = calibration, circles, one.name
+        walk = inputs.extract_video(store, one.folder, settings, recording.fps, chosen, *lenses)
     ready = replace(one, folder=store.root / "frames" / one.name, extracted=True)
     if walk is None:
         return ready

@@ -8,7 +8,7 @@ from pathlib import Path
 import insta360_files as made
 import numpy as np
 import pytest
-from command import run_gsba
+from command import fails, run_gsba
 from two_fisheyes import picture
 from video_files import encode, steady
 
@@ -91,6 +91,17 @@ def test_its_name_says_that_it_is_raw_where_no_circle_shows(
     extract(video.rename(tmp_path / "v.mp4"), tmp_path / "panoramas", EVERY)
     assert not (tmp_path / "panoramas/front").exists()
     assert not (tmp_path / "panoramas" / FACTORY_FILE).exists()
+
+
+def test_circles_that_are_given_count_where_the_video_is_followed(tmp_path: Path) -> None:
+    """Whatever else is unknown of such pictures, circles are not looked for."""
+    plain = np.full((SIDE, 2 * SIDE, 3), 200, np.uint8)
+    video = _video(tmp_path / "v.insv", plain)
+    given = "--circle", f"{SIDE / 2},{SIDE / 2},{SIDE / 2}"
+    refine = "refine", video, "--out", tmp_path / "run"
+    for call in (refine, ("track", video, "--out", tmp_path / "walk.tum")):
+        fails(run_gsba("-q", *call), "show no bright circle")
+        fails(run_gsba("-q", *call, *given), "overlap at the rims does not determine")
 
 
 def test_another_extraction_leaves_no_lenses_behind(tmp_path: Path) -> None:
