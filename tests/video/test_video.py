@@ -321,6 +321,14 @@ def test_a_black_video_is_refused_before_it_is_followed(
     fails(run_gsba(*chosen, "--sharpest"), "--every auto keeps sharp frames already")
 
 
+def test_times_for_a_video_are_refused(film: Path, tmp_path: Path) -> None:
+    """They would have no effect, but for a trajectory that has none of its own."""
+    times = tmp_path / "times.csv"
+    times.write_text("name,timestamp\n000000,0.0\n")
+    done = run_gsba("refine", film, "--timestamps", times, "--out", tmp_path / "run")
+    fails(done, "a video holds the times of its frames: leave out --timestamps")
+
+
 def test_fewer_frames_than_chosen_before_are_another_extraction(film: Path, tmp_path: Path) -> None:
     at, out = tmp_path / "frames.tum", tmp_path / "frames"
     write_tum(at, Trajectory(np.arange(5) / 4, np.tile(np.eye(4), (5, 1, 1))))
