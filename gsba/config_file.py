@@ -1,5 +1,4 @@
-"""Settings from TOML files and `stage.key=value` overrides, and back; TOML's `"none"` stands for
-None."""
+"""Settings from TOML files and `stage.key=value` overrides, and back; None is "none" in TOML."""
 
 import json
 import tomllib

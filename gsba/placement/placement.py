@@ -335,15 +335,7 @@ def _on_earth(
             )
     fit = dataclasses.replace(found.similarity, rotation=found.similarity.rotation @ level)
     ups = -reconstruction.world_T_rigs[fixes.frames, :3, 1] @ fit.rotation.T
-    if np.median(ups[:, 2]) < _UPSIDE_DOWN:
-        logger.warning(
-            "--gps %s: the placed run is upside down: in the file, latitude and longitude are "
-            "swapped, or a direction is reversed, unless the camera hung head down; --up auto "
-            "refuses such positions",
-            path,
-        )
-    elif up_sigma is None:
-        _warn_of_lean(path, ups, float(np.degrees(found.tilt_sigma)))
+    _warn_of_lean(path, ups, np.inf if up_sigma is not None else np.degrees(found.tilt_sigma))
     sigmas = found.position_sigmas(everywhere @ level.T)  # also where there are no fixes
     grounds = {
         **upright.grounds,
@@ -381,8 +373,16 @@ def _on_earth(
 
 
 def _warn_of_lean(path: Path, ups: np.ndarray, tilt_sigma_deg: float) -> None:
-    """Warn where cameras whose up axes (G, 3), placed, are alike lean much more than the tilt is
-    uncertain by: altitudes that jump or drift tilt a run."""
+    """Warn of cameras, by their placed up axes (G, 3), that hang head down, or that are alike and
+    lean much more than the tilt is uncertain by: altitudes that jump or drift tilt a run."""
+    if np.median(ups[:, 2]) < _UPSIDE_DOWN:
+        logger.warning(
+            "--gps %s: the placed run is upside down: in the file, latitude and longitude are "
+            "swapped, or a direction is reversed, unless the camera hung head down; --up auto "
+            "refuses such positions",
+            path,
+        )
+        return
     held = ups.mean(axis=0)
     lean = float(np.degrees(np.arctan2(np.hypot(held[0], held[1]), held[2])))
     if np.linalg.norm(held) > 0.9 and lean > max(_MAX_LEAN_DEG, 3 * tilt_sigma_deg):
