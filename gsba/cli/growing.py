@@ -6,7 +6,7 @@ from typing import Any
 import typer
 
 from gsba.cli.app import command, loading
-from gsba.cli.recordings import recordings_of
+from gsba.cli.recordings import circle_of, recordings_of
 from gsba.cli.refining import PARTIAL, conclude
 from gsba.log import GsbaError
 
@@ -22,6 +22,7 @@ def add(
     masks: list[Path] | None = None,
     segment: str | None = None,
     calibration: Path | None = None,
+    circle: list[str] | None = None,
     fps: float | None = None,
     cluster: str | None = None,
     allow_partial: bool = False,
@@ -39,6 +40,7 @@ def add(
         from gsba.store.cluster import connected
     shared: dict[str, Any] = {"odometry": False if no_trajectory else None, "fps": fps}
     shared |= {"masks": masks or "auto", "calibration": calibration}
+    shared["circles"] = [circle_of(text) for text in circle or ()]
     recordings = recordings_of(new or (), recording or (), shared)
     _refuse_changed([run])
     with connected(cluster) as client:

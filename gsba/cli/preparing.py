@@ -91,18 +91,24 @@ def _chosen_by_odometry(
 
 @command
 def mask(
-    frames: Path, out: Path, masks: Path | None = None, calibration: Path | None = None
+    frames: Path,
+    out: Path,
+    masks: Path | None = None,
+    calibration: Path | None = None,
+    circle: list[str] | None = None,
 ) -> None:
     """Find the carrier of the camera and write its mask.
 
     The carrier is whoever or whatever holds the camera and stays in the same place of every image.
     """
+    from gsba.frames.image_circles import given_circles
     from gsba.frames.scan import scan
     from gsba.masks.carrier import find_carrier, write_carrier
 
     if out.resolve() == frames.resolve():
         raise GsbaError(f"--out {out} is the folder of the frames: choose another for masks")
-    found_frames = scan(frames, masks=masks, order_suffices=True, calibration=calibration)
+    circles = given_circles([circle_of(text) for text in circle or ()], calibration)
+    found_frames = scan(frames, None, None, masks, True, calibration, circles)
     carrier = find_carrier(found_frames)
     written = write_carrier(carrier, found_frames, out)
     result = carrier.reason or f"the carrier covers {100 * carrier.share:.1f}% of the image"
@@ -127,8 +133,8 @@ def track(
 ) -> None:
     """Estimate a pose for every frame by visual odometry."""
     from gsba import odometry
+    from gsba.frames.image_circles import given_circles
     from gsba.odometry.walk import write_odometry
-    from gsba.pipeline.inputs import given_circles
     from gsba.video import is_video
 
     if out.is_dir():

@@ -4,11 +4,13 @@ tried many times; the one that most rays agree with is refined."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
 
 from gsba.geometry import unit
+from gsba.log import GsbaError
 from gsba.types.records import slices
 
 _DARK_OFFSET = 8.0  # grey values added before the logarithm: noise of black pixels is no edge
@@ -44,6 +46,26 @@ class ImageCircle:
         """The circle in a picture of `factor` times the resolution."""
         x, y, radius, sigma = (factor * v for v in (self.x, self.y, self.radius, self.sigma))
         return ImageCircle(x, y, radius, self.support, sigma)
+
+
+def given_circles(
+    circles: Sequence[tuple[float, float, float]], calibration: Path | None
+) -> tuple[ImageCircle, ...]:
+    """Image circles of the front and the back lens, or one of both, as a caller gives them;
+    GsbaError for more than two, what is no circle, or a calibration as well."""
+    if not circles:
+        return ()
+    if calibration is not None:
+        raise GsbaError(
+            f"--circle and --calibration {calibration} both say where image circles are: pass one"
+        )
+    if len(circles) > 2:
+        raise GsbaError(f"--circle: {len(circles)} are given; a camera of two lenses has two")
+    for circle in circles:
+        if len(circle) != 3 or not np.isfinite(circle).all() or circle[2] <= 0:
+            said = ",".join(f"{value:g}" for value in circle)
+            raise GsbaError(f"--circle {said}: give X,Y,R: a centre and a positive radius, pixels")
+    return tuple(ImageCircle(*map(float, circle)) for circle in circles)
 
 
 @dataclass(frozen=True, slots=True)

@@ -145,26 +145,6 @@ def with_baseline(settings: RefineSettings, calibration: Path | None) -> RefineS
     return settings.model_copy(update={"camera": camera})
 
 
-def given_circles(
-    circles: Sequence[tuple[float, float, float]], calibration: Path | None
-) -> tuple[ImageCircle, ...]:
-    """Image circles of the front and the back lens, or one of both, as a caller gives them;
-    GsbaError for more than two, what is no circle, or a calibration as well."""
-    if not circles:
-        return ()
-    if calibration is not None:
-        raise GsbaError(
-            f"--circle and --calibration {calibration} both say where image circles are: pass one"
-        )
-    if len(circles) > 2:
-        raise GsbaError(f"--circle: {len(circles)} are given; a camera of two lenses has two")
-    for circle in circles:
-        if len(circle) != 3 or not np.isfinite(circle).all() or circle[2] <= 0:
-            said = ",".join(f"{value:g}" for value in circle)
-            raise GsbaError(f"--circle {said}: give X,Y,R: a centre and a positive radius, pixels")
-    return tuple(ImageCircle(*map(float, circle)) for circle in circles)
-
-
 def read_gyro(imu: Path | None, frames: Path) -> Readings | None:
     """Readings that a run is given, or that its raw video holds; a video without them, or without
     the library that reads them, is taken as it is. GsbaError if `imu` cannot be used."""

@@ -7,6 +7,7 @@ from pathlib import Path
 from gsba import video
 from gsba.config import CameraSettings, RefineSettings
 from gsba.config_file import validated
+from gsba.frames.image_circles import given_circles
 from gsba.frames.scan import scan
 from gsba.log import GsbaError
 from gsba.masks import merging
@@ -95,7 +96,7 @@ class GivenRecording:
         timestamps, fps = (None, None) if self.extracted else (_path(one.timestamps), one.fps)
         calibration = _path(one.calibration)
         with naming_recording(self.name):
-            circles = inputs.given_circles(one.circles, calibration)
+            circles = given_circles(one.circles, calibration)
             by_order = not self.trajectories
             return scan(self.folder, timestamps, fps, given, by_order, calibration, circles)
 
@@ -159,7 +160,7 @@ def _extracted(one: GivenRecording, store: RunStore, settings: RefineSettings) -
     chosen = merging.choose(recording.masks) if followed else None
     calibration = _path(recording.calibration)
     with naming_recording(one.name):
-        circles = inputs.given_circles(recording.circles, calibration)
+        circles = given_circles(recording.circles, calibration)
         lenses = calibration, circles, one.name
         walk = inputs.extract_video(store, one.folder, settings, recording.fps, chosen, *lenses)
     ready = replace(one, folder=store.root / "frames" / one.name, extracted=True)

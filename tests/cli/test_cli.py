@@ -26,6 +26,7 @@ from gsba.config import RefineSettings
 from gsba.config_file import load_config
 from gsba.export import ExportFormat
 from gsba.log import GsbaError
+from gsba.pipeline.recordings import Recording
 
 
 @pytest.fixture
@@ -98,6 +99,18 @@ def test_wrong_settings_name_the_key() -> None:
     fails(run_gsba("show-config", "--config", "nowhere.toml"), "cannot read settings nowhere.toml")
     fails(run_gsba("refine", "a", "b", "--out", "c", "--set", "x=1"), "unknown setting x")
     assert not Path("c").exists()
+
+
+def test_circles_of_recordings_that_are_added(monkeypatch: pytest.MonkeyPatch) -> None:
+    def added(run: Path, recordings: list[Recording], *_: object, **__: object) -> None:
+        raise GsbaError(f"circles of {recordings[0].frames}: {recordings[0].circles}")
+
+    monkeypatch.setattr("gsba.pipeline.add_recordings", added)
+    monkeypatch.setattr("gsba.cli.growing._refuse_changed", lambda runs: None)
+    fails(
+        run_gsba("add", "run", "raw", "--circle", "72,71,70"),
+        "circles of raw: [(72.0, 71.0, 70.0)]",
+    )
 
 
 def test_factors_are_a_setting() -> None:

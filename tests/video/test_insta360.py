@@ -93,13 +93,16 @@ def test_its_name_says_that_it_is_raw_where_no_circle_shows(
     assert not (tmp_path / "panoramas" / FACTORY_FILE).exists()
 
 
-def test_circles_that_are_given_count_where_the_video_is_followed(tmp_path: Path) -> None:
-    """Whatever else is unknown of such pictures, circles are not looked for."""
+def test_circles_that_are_given_are_not_looked_for(tmp_path: Path) -> None:
+    """Where a video is followed, too; the pictures tell nothing else of the lenses."""
     plain = np.full((SIDE, 2 * SIDE, 3), 200, np.uint8)
     video = _video(tmp_path / "v.insv", plain)
     given = "--circle", f"{SIDE / 2},{SIDE / 2},{SIDE / 2}"
+    extract(video, tmp_path / "frames", EVERY)
     refine = "refine", video, "--out", tmp_path / "run"
-    for call in (refine, ("track", video, "--out", tmp_path / "walk.tum")):
+    track = "track", video, "--out", tmp_path / "walk.tum"
+    mask = "mask", tmp_path / "frames", "--out", tmp_path / "masks"
+    for call in (refine, track, mask):
         fails(run_gsba("-q", *call), "show no bright circle")
         fails(run_gsba("-q", *call, *given), "overlap at the rims does not determine")
 
