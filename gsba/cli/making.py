@@ -34,12 +34,15 @@ def splat(
     defaults and in one run's folder. The same call again resumes.
     """
     from gsba.export.trainers import format_of
+    from gsba.splat.backend import choose_backend
 
-    if to is not None and iterations is not None:
-        raise GsbaError(f"--to {to} trains nothing here: leave out --iterations")
-    if to is not None:
-        format_of(to)  # fails before hours of work
+    if to is not None and (iterations is not None or backend != "auto"):
+        raise GsbaError(f"--to {to} trains nothing here: leave out --iterations and --backend")
     training = splat_settings(iterations, face_size, backend)
+    if to is not None:  # both fail before hours of work
+        format_of(to)
+    elif backend != "auto":
+        choose_backend(backend)
     camera_name = [f'camera.name="{camera}"'] if camera is not None else []
     settings = settings_of(config, [*camera_name, *(overrides or ())], None)
     with loading():

@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
-from command import run_gsba, succeed
+from command import fails, run_gsba, succeed
 from tiny_run import Case
 
 from gsba.config import RefineSettings
@@ -45,6 +45,18 @@ def test_splat_writes_a_trainers_dataset(
 def test_splat_refuses_a_wrong_trainer_before_it_refines(tmp_path: Path) -> None:
     done = run_gsba("splat", tmp_path / "walk.mp4", "--to", "brsh")
     assert done.exit_code == 1 and "--to brsh is not known" in done.stderr
+
+
+def test_splat_refuses_a_renderer_that_is_not_there_before_it_refines(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def nowhere() -> None:
+        raise GsbaError("the gsplat backend needs a CUDA device: use --backend cpu")
+
+    monkeypatch.setattr("gsba.splat.gpu.GsplatBackend", nowhere)
+    call = "splat", tmp_path / "walk.mp4", "--backend", "gsplat"
+    fails(run_gsba(*call), "the gsplat backend needs a CUDA device")
+    fails(run_gsba(*call, "--to", "brush"), "leave out --iterations and --backend")
 
 
 def test_summaries_of_commands_fit_their_lines() -> None:
