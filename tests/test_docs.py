@@ -173,6 +173,13 @@ def test_settings_exist() -> None:
     assert not refused, refused
 
 
+def test_events_are_listed() -> None:
+    code = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "gsba").rglob("*.py"))
+    kinds = set(re.findall(r"(?<!\w)event\(\s*\"(\w+)\"", code))
+    table = (DOCS / "app.md").read_text().partition("## Events")[2]
+    assert kinds == set(re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE)) - {"event"}
+
+
 def test_presets_exist() -> None:
     missing = [
         f"{_name(page)}: {name}"
