@@ -28,8 +28,8 @@ _SOURCE = Path(__file__).parents[1]  # folder of gsba's own code
 _MEMORY_SETTINGS = {  # first letters of a stage's name -> settings that lower its memory
     "features": "cubemap.max_face_size, features.max_per_face or solver.num_threads",
     "align": "patches.max_width or solver.num_threads",
-    "photometric": "photometric.max_width or photometric.targets",
-    "splat": "splat.sizes or splat.max_gaussians",
+    "photometric": "solver.num_threads, leave photometric out of factors",
+    "splat": "splat.sizes",
     "export": "export.face_size",
 }
 _DEFAULT_MEMORY_SETTING = "features.max_per_face"  # of all other stages

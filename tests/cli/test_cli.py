@@ -6,6 +6,7 @@ import io
 import json
 import logging
 import os
+import re
 import subprocess
 import sys
 import types
@@ -20,10 +21,10 @@ from command import fails, run_gsba, succeed
 import gsba
 from gsba import log
 from gsba.cli import app
-from gsba.cli.app import loading
+from gsba.cli.app import _DEFAULT_MEMORY_SETTING, _MEMORY_SETTINGS, loading
 from gsba.cli.options import OPTIONS
 from gsba.config import RefineSettings
-from gsba.config_file import load_config
+from gsba.config_file import allowed_settings, load_config
 from gsba.export import ExportFormat
 from gsba.log import GsbaError
 from gsba.pipeline.recordings import Recording
@@ -159,6 +160,12 @@ def test_memory_errors_name_the_stage_and_its_settings(
     error.add_note("align1")
     fails(run_gsba("export", "run", "--to", "ply"), "(stage align1; Unable")
     fails(run_gsba("export", "run", "--to", "ply"), "lower patches.max_width or solver.num_threads")
+
+
+def test_settings_that_memory_errors_name_exist() -> None:
+    known = {name for name, _, _ in allowed_settings(RefineSettings())}
+    advice = " ".join([*_MEMORY_SETTINGS.values(), _DEFAULT_MEMORY_SETTING])
+    assert set(re.findall(r"\w+\.\w+", advice)) <= known
 
 
 def test_messages_are_short_and_printable(pipeline: Callable[[BaseException], None]) -> None:
