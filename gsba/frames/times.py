@@ -177,7 +177,8 @@ def frame_times(
         if films := _films(names):
             _log.warning(
                 "names of frames are numbered anew after %s: if these are several films, give each "
-                "a folder of its own (gsba refine A B), as a place that looks alike may join them",
+                "a folder of its own (gsba refine A B --out RUN), as a place that looks alike may "
+                "join them",
                 ", ".join(f"'{name}'" for name in films),
             )
         return _relative_times(names) / (fps or 1.0), False
