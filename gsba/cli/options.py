@@ -67,7 +67,7 @@ OPTIONS = {  # PARAMETER, or COMMAND.PARAMETER where commands differ -> its help
     "calibration": _option("Calibration of the lenses of raw fisheyes.", "FILE"),
     "fps": _option(
         "Frame rate of a folder, from time 0. Of a video: frames to keep per second; default: "
-        "odometry chooses them."
+        "odometry chooses them, or, where a trajectory is given, 1."
     ),
     "cluster": _option(
         "Dask scheduler whose workers share the work of frames and pairs: tcp://HOST:PORT, its "
