@@ -49,8 +49,8 @@ OPTIONS = {  # PARAMETER, or COMMAND.PARAMETER where commands differ -> its help
     "overrides": _option("Override a setting; repeatable.", "STAGE.KEY=VALUE", "--set"),
     "masks": _option(
         "One mask for all frames, or a folder of masks; white = use. auto (default): mask the "
-        "carrier of the camera where it is found; carrier: fail where it is not; distractors: mask "
-        "moving objects; none. Repeatable.",
+        "carrier of the camera where it is found; carrier: fail where frames do not tell it; "
+        "distractors: mask moving objects; none. Repeatable.",
         "PATH",
     ),
     "segment": _option(

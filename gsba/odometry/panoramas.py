@@ -176,7 +176,7 @@ def _lenses(
     with TemporaryDirectory(prefix="gsba-") as name:
         pairs = []
         for index, pictures in shots(recording, rows[looks].tolist()):
-            pair = tuple(Path(name) / lens / f"{index:06d}.png" for lens in ("front", "back"))
+            pair = tuple(Path(name) / f"lens{n}" / f"{index:06d}.png" for n in range(2))
             for path, picture in zip(pair, pictures, strict=True):
                 path.parent.mkdir(exist_ok=True)
                 write_image(path, picture.luma())
