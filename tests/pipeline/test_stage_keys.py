@@ -7,14 +7,21 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from plain_records import frames_of
 from pydantic import BaseModel
+from synthetic import loop_walk
 from tiny_run import LIGHT, Case
 
 from gsba import refine
+from gsba.config import RefineSettings
 from gsba.config_file import load_config
+from gsba.frames.recordings import combine
+from gsba.pipeline.run import Run
 from gsba.store import store
-from gsba.store.store import RunStore
+from gsba.store.store import RunStore, load_stage
+from gsba.types import CoarsePoses, FrameSet, PictureFormat
 
 CHANGES = (*LIGHT, "seed=7919", "weak_frames.mode=auto", "export.formats=[]")
 # Results do not depend on threads. Keys have the readout and the stitching radius of a camera
@@ -62,3 +69,24 @@ def test_keys_of_stages_hold_the_settings_that_these_read(
         and (value if name in UNNAMED else f'"{name}": ') not in keys[stage]
     }
     assert not missing and sum(map(len, read.values())) > 30
+
+
+@pytest.mark.parametrize(("clock_s", "origin"), [(1000.0, [0.0, 0, 0]), (0.0, [5e5, 0, 0])])
+def test_clocks_of_recordings_and_the_origin_of_the_world_are_in_keys(
+    clock_s: float, origin: list[float], tmp_path: Path
+) -> None:
+    """Though the times of recordings laid end to end, and poses near the origin, stay the same."""
+    (tmp_path / "0.jpg").touch()
+    kind, paths = PictureFormat("erp", 512, 256), [(tmp_path / "0.jpg",)]
+    frames = combine({"walk": frames_of(kind, paths * 4)})
+    moved = frames_of(kind, paths * 4, times=clock_s + np.arange(4.0))
+    poses, sources = loop_walk(4), np.zeros(4, np.uint8)
+    given = [
+        (frames, CoarsePoses(poses, sources, 0.0, origin=np.zeros(3))),
+        (combine({"walk": moved}), CoarsePoses(poses, sources, 0.0, origin=np.array(origin))),
+    ]
+    for known, coarse in given:
+        with RunStore(tmp_path / "run", {"frames": tmp_path}) as run:
+            Run.begin(run, known, coarse, RefineSettings())
+            assert not run.records["frames"].resumed
+    assert load_stage(tmp_path / "run", "frames", FrameSet).clock_shifts == (-clock_s,) * 4
