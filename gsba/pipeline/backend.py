@@ -306,7 +306,8 @@ def reconstruct(
         )
         return result if amended is None else amended(result)
 
-    return run.stage("reconstruction", run.solving_key(), compute, Reconstruction)
+    published = [camera.baseline() for camera in run.camera_settings]  # of several, see `_baseline`
+    return run.stage("reconstruction", [*run.solving_key(), *published], compute, Reconstruction)
 
 
 def _baseline(state: State, scale: float) -> tuple[float, float] | None:

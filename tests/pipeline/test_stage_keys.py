@@ -5,6 +5,7 @@ import json
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,9 +16,10 @@ from synthetic import loop_walk
 from tiny_run import LIGHT, Case
 
 from gsba import refine
-from gsba.config import RefineSettings
+from gsba.config import CameraSettings, RefineSettings
 from gsba.config_file import load_config
 from gsba.frames.recordings import combine
+from gsba.pipeline import backend, camera
 from gsba.pipeline.run import Run
 from gsba.store import store
 from gsba.store.store import RunStore, load_stage
@@ -90,3 +92,27 @@ def test_clocks_of_recordings_and_the_origin_of_the_world_are_in_keys(
             Run.begin(run, known, coarse, RefineSettings())
             assert not run.records["frames"].resumed
     assert load_stage(tmp_path / "run", "frames", FrameSet).clock_shifts == (-clock_s,) * 4
+
+
+def test_baselines_are_in_keys_of_results_that_depend_on_them() -> None:
+    """How centres are judged depends on whether one is published, and that of several cameras'
+    lenses in the result on the lengths."""
+
+    def keys(*millimetres: float | None) -> str:
+        cameras = tuple(CameraSettings(baseline_mm=one) for one in millimetres)
+        several, kept = cameras if len(cameras) > 1 else (), list[object]()
+        run = SimpleNamespace(
+            frames=SimpleNamespace(formats=cameras),
+            settings=RefineSettings(),
+            camera_settings=several,
+            settings_of=cameras.__getitem__,
+            solving_key=list,
+            stage=lambda name, key, *_: kept.append(key),
+        )
+        nothing, prior = SimpleNamespace(), SimpleNamespace(turning_only=False)
+        state: Any = SimpleNamespace(run=run, prior=prior, map=nothing, solution=nothing)
+        backend.reconstruct(state)
+        return store.digest(camera._settings_of_cameras(state.run), kept)
+
+    assert keys(None) != keys(32.0) == keys(30.0)
+    assert keys(32.0, 28.0) != keys(32.0, 30.0)
