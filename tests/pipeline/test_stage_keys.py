@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -16,11 +16,13 @@ from synthetic import loop_walk
 from tiny_run import LIGHT, Case
 
 from gsba import refine
-from gsba.config import CameraSettings, RefineSettings
+from gsba.camera.cameras import Cameras
+from gsba.config import CameraSettings, ExportSettings, RefineSettings
 from gsba.config_file import load_config
 from gsba.frames.recordings import combine
-from gsba.pipeline import backend, camera
+from gsba.pipeline import backend, camera, outputs
 from gsba.pipeline.run import Run
+from gsba.placement.placement import Placement
 from gsba.store import store
 from gsba.store.store import RunStore, load_stage
 from gsba.types import CoarsePoses, FrameSet, PictureFormat
@@ -116,3 +118,27 @@ def test_baselines_are_in_keys_of_results_that_depend_on_them() -> None:
 
     assert keys(None) != keys(32.0) == keys(30.0)
     assert keys(32.0, 28.0) != keys(32.0, 30.0)
+
+
+def test_every_kind_of_exported_images_has_a_key_of_its_own(tmp_path: Path) -> None:
+    """Metashape gets panoramas by default, and faces on request."""
+    frames = frames_of(PictureFormat("erp", 512, 256), [(tmp_path / "0.jpg",)])
+
+    def key(**settings: Any) -> object:
+        kept = list[object]()
+        folder = SimpleNamespace(
+            root=tmp_path,
+            forget=lambda _: None,
+            stored=lambda *given: kept.append(given[1]),
+            stage=lambda *_: None,
+            claim=lambda _: None,
+        )
+        export = ExportSettings(formats=("metashape",), **settings)
+        chosen = RefineSettings(export=export)
+        run: Any = SimpleNamespace(store=folder, settings=chosen, latest=[])
+        outputs._export(run, cast(Any, None), frames, Placement(), Cameras.plain(frames))
+        return kept
+
+    given: list[dict[str, Any]] = [{}, {"images": "cube"}, {"fetched": True}, {"face_size": 64}]
+    keys = [store.digest(key(**settings)) for settings in given]
+    assert len({*keys}) == len(given) and keys[0] == store.digest(key())
