@@ -139,8 +139,9 @@ class Run:
         if not families.observing_points.members:
             raise GsbaError("factors: no family observes points; add bearing or reprojection")
         paths = [*(path for group in frames.paths for path in group), *frames.mask_paths]
-        origin = None if coarse.origin is None else coarse.origin.tolist()
-        start = coarse.world_T_rigs.tolist(), origin, settings.read
+        origins = [coarse.origin, *(one.coarse.origin for one in evidence.recordings)]
+        origins = [origin if origin is None else origin.tolist() for origin in origins]
+        start = coarse.world_T_rigs.tolist(), origins, settings.read
         timed_frames = frames.timed_of_frame or frames.timed
         timing = frames.timestamps.tolist(), frames.clock_shifts, timed_frames
         inputs = [fingerprint(paths), *timing, *start]

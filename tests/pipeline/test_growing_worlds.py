@@ -14,6 +14,7 @@ from synthetic import loop_walk, make_world
 from gsba import Recording
 from gsba.config import CameraSettings, RefineSettings
 from gsba.pipeline import growing
+from gsba.pipeline.each_recording import joined_poses
 from gsba.pipeline.finished_run import FinishedRun
 from gsba.pipeline.joint_map import JointMaps
 from gsba.pipeline.map import Map
@@ -130,3 +131,22 @@ def test_what_is_known_of_a_map_leaves_with_it() -> None:
     assert left.vertical is None and left.origin is None
     left = run.without(["z"]).result
     assert left.vertical is UP and left.origin is ORIGIN
+
+
+@pytest.mark.parametrize("followed", [True, False])  # whether the first recording has a trajectory
+@pytest.mark.parametrize("apart", [True, False])
+def test_the_origin_is_that_of_the_recording_whose_world_the_largest_map_has(
+    followed: bool, apart: bool
+) -> None:
+    poses, sizes = loop_walk(SMALL + LARGE), (SMALL, LARGE)
+    sources = [PoseSource.SLAM if followed else PoseSource.NONE, PoseSource.SLAM]
+    origins = [np.array([1e6, 0.0, 0.0]) if followed else None, ORIGIN]
+    parts = np.split(poses, [SMALL])
+    each = [
+        CoarsePoses(part, np.full(num, source, np.uint8), 0.0, origin=origin)
+        for part, num, source, origin in zip(parts, sizes, sources, origins, strict=True)
+    ]
+    prior = Prior.of(replace(joined_poses(each), segments=None))
+    maps = np.repeat([1, 0], sizes) if apart else None
+    prior = replace(prior, parts=maps, of_recordings=tuple(map(Prior.of, each)))
+    assert prior.worlds().origin is (origins[0] if followed and not apart else ORIGIN)
