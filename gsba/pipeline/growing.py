@@ -13,7 +13,13 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from gsba.config import CameraSettings, GpsSettings, PlacementSettings
-from gsba.disk import disk_errors, exchange_folders, hold_folder, link_or_copy
+from gsba.disk import (
+    disk_errors,
+    exchange_folders,
+    hold_folder,
+    link_or_copy,
+    with_own_name,
+)
 from gsba.frames.recordings import combine
 from gsba.log import GsbaError
 from gsba.masks.segmentation import Segment
@@ -338,9 +344,9 @@ class _Place:
     def of(cls, root: Path | None, out: Path | str | None) -> "_Place":
         """A place for the result of a run that grows; GsbaError if there is something."""
         if root is not None and (out is None or Path(out).resolve() == root.resolve()):
-            return cls(root)
+            return cls(with_own_name(root))
         assert out is not None
-        out = Path(out)
+        out = with_own_name(Path(out))
         if out.is_symlink() or (out.exists() and not (out.is_dir() and not any(out.iterdir()))):
             raise GsbaError(f"{out} exists: choose another --out")
         if not out.parent.is_dir():

@@ -8,6 +8,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from command import fails, run_gsba
 from plain_records import frames_of, map_of
 from synthetic import loop_walk, make_world
 
@@ -150,3 +151,15 @@ def test_the_origin_is_that_of_the_recording_whose_world_the_largest_map_has(
     maps = np.repeat([1, 0], sizes) if apart else None
     prior = replace(prior, parts=maps, of_recordings=tuple(map(Prior.of, each)))
     assert prior.worlds().origin is (origins[0] if followed and not apart else ORIGIN)
+
+
+@pytest.mark.parametrize("place", [Path("."), Path("stages/..")])
+def test_a_run_grows_where_it_is_the_current_folder(
+    place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "run" / "stages").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "run")
+    assert growing._Place.of(place, None).out == tmp_path / "run"
+    fails(
+        run_gsba("localize", tmp_path / "other", place), "is not a gsba run"
+    )  # pictures of this folder
