@@ -62,6 +62,11 @@ def atomic_write(path: Path, write: Callable[[Path], object], parents: bool = Tr
             temporary.unlink(missing_ok=True)
 
 
+def with_own_name(path: Path) -> Path:
+    """The path of a file or folder, absolute where it ends without a name, as `.` and `..` do."""
+    return path if path.name not in ("", "..") else Path(os.path.abspath(path))
+
+
 def write_text(path: Path, text: str) -> None:
     """Write a text as UTF-8, atomically; see `atomic_write`."""
     atomic_write(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))

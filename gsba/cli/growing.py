@@ -111,9 +111,11 @@ def localize(
     The index of the run's places is kept beside it, in RUN-index.
     """
     with loading():
+        from gsba.disk import with_own_name
         from gsba.localization import Localizer, find_pictures, localize_all, write_localized
 
-    out = out or images[0].with_name(f"{images[0].stem}-localized")
+    first = with_own_name(images[0])
+    out = out or first.with_name(f"{first.stem}-localized")
     if out.resolve() == run.resolve() or run.resolve() in out.resolve().parents:
         raise GsbaError(f"--out {out} is in the run's folder, which stays as it is: choose another")
     localizer = Localizer(run, map_number, not fast, camera_of)

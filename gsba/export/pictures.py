@@ -291,8 +291,8 @@ class SharedPixels:
         style: MaskStyle,
         differ: bool,
     ) -> None:
-        """Write masks (h, w) bool that depend only on the key, and on the frame's mask file or, if
-        they differ, on the frame."""
+        """Write masks (h, w) bool that depend only on the key, the camera's format and the frame's
+        mask file or, if they differ, on the frame."""
 
         def drawn() -> Iterable[np.ndarray]:
             return map(style.drawn, make())
@@ -300,7 +300,7 @@ class SharedPixels:
         def encode() -> list[bytes]:
             return list(map(encoded_image, drawn(), paths))
 
-        key = "mask", key, style.hidden, self.frames.mask_paths[self.f]
+        key = "mask", key, style.hidden, self.kind, self.frames.mask_paths[self.f]
         if (self._pictures._uses[self._pictures.frames.mask_paths[self.f]] > 1) and not differ:
             _write(paths, self._pictures.masks(key, encode))
         else:

@@ -69,7 +69,8 @@ def segmented(store: RunStore, frames: FrameSet, segment: Segment) -> PerFrame[S
         return Segmented(np.packbits(use), size)
 
     sizes = [cubemap.native_rig(kind, _MAX_FACE_PX).size for kind in frames.formats]
-    key = [uuid.uuid4().hex if callable(segment) else segment, *sizes]
+    cut_by = [kind.fisheyes for kind in frames.formats]
+    key = [uuid.uuid4().hex if callable(segment) else segment, *sizes, cut_by]
     items = {name: fingerprint(frames.paths[f]) for name, f in index.items()}
     found = store.per_frame("segmented", key, items, compute, Segmented, alone=True)
     shutil.rmtree(folder, ignore_errors=True)

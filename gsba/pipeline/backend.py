@@ -31,7 +31,6 @@ from gsba.matching import correspondences
 from gsba.photometric import direct
 from gsba.photometric.direct import PhotometricResult
 from gsba.pipeline.acceptance import NoPositions
-from gsba.pipeline.run import Run
 from gsba.pipeline.stage_titles import WITHOUT_GPS
 from gsba.pipeline.state import MapMatches, State
 from gsba.placement.placement import metres_per_unit
@@ -285,11 +284,12 @@ def reconstruct(
         covariances, joint = common_errors.added(
             measured.poses, measured.joint, solution.world_T_rigs, prior.parts
         )
+        worlds = None if run.families.fixing_gauge.members else prior.worlds()
         result = assemble(
             solution,
             covariances,
             observed,
-            None if run.families.fixing_gauge.members else prior.worlds(),
+            worlds,
             MIN_OBSERVATIONS,
             prior.trust.false_frames,
             prior.parts,
@@ -302,11 +302,12 @@ def reconstruct(
             formats=frames.formats,
             vertical=_vertical(state, result),
             lens_baseline=_baseline(state, world_scale(solution, result)),
-            origin=_origin(run, result),
+            origin=worlds and worlds.origin,
         )
         return result if amended is None else amended(result)
 
-    return run.stage("reconstruction", run.solving_key(), compute, Reconstruction)
+    published = [camera.baseline() for camera in run.camera_settings]  # of several, see `_baseline`
+    return run.stage("reconstruction", [*run.solving_key(), *published], compute, Reconstruction)
 
 
 def _baseline(state: State, scale: float) -> tuple[float, float] | None:
@@ -329,12 +330,6 @@ def _baseline(state: State, scale: float) -> tuple[float, float] | None:
     length = known[0][1][0] / mean
     misfit = float(weights @ (metres[:, 0] - mean) ** 2) / (len(known) - 1)
     return length, length * float((max(misfit, 1.0) / weights.sum()) ** 0.5) / mean
-
-
-def _origin(run: Run, result: Reconstruction) -> np.ndarray | None:
-    """Origin of the largest map's world, if it is that of the first trajectory."""
-    another = result.components is not None and result.components[0] != 0
-    return None if another or run.families.fixing_gauge.members else run.coarse.origin
 
 
 def _vertical(state: State, result: Reconstruction) -> np.ndarray | None:
@@ -362,7 +357,8 @@ def _reconstruct_rotations(state: State) -> Reconstruction:
         tied = connectivity.within(matches, parts)
         found = tracks.build([tied], np.diff(observed.keypoints.starts))
         result = rotation_only.refine(found, observed.keypoints, poses, prior.coarse, least, parts)
-        return replace(result, origin=_origin(run, result))
+        another = result.components is not None and result.components[0] != 0  # than the first's
+        return replace(result, origin=None if another else run.coarse.origin)
 
     key = [run.matching_key(), least]
     return run.stage("reconstruction", key, compute, Reconstruction)

@@ -487,4 +487,5 @@ def _settings_of_cameras(run: Run) -> list[object]:
         left_out |= {"lens_yaws_deg"} if camera.lens_yaws_deg is None else set()
         given = camera.model_dump(exclude=left_out)
         found += [given, camera.readout(), camera.inverse_stitch_radius(1.0)]
+        found.append(camera.baseline() is not None)
     return [run.solving_key(), *found, run.settings.seed]

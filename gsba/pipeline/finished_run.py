@@ -162,7 +162,8 @@ def _tied(map_: Map, frames: FrameSet) -> np.ndarray:
     owners = np.unique([name.rpartition("/")[0] for name in frames.names], return_inverse=True)[1]
     tracks = map_.solution.landmarks.tracks
     points_seen = np.unique(np.column_stack([owners[tracks.frames], tracks.points]), axis=0)
-    seen = coo_matrix((np.ones(len(points_seen)), points_seen.T)).tocsr()
+    shape = int(owners.max()) + 1, tracks.num_points
+    seen = coo_matrix((np.ones(len(points_seen)), points_seen.T), shape).tocsr()
     shared = (seen @ seen.T).toarray() >= _MIN_SHARED_POINTS
     return connected_components(shared, directed=False)[1][owners]
 
@@ -174,12 +175,13 @@ def _result_of(result: Reconstruction, rows: np.ndarray, groups: np.ndarray) -> 
     components = by_size(np.unique(np.column_stack([own, groups]), axis=0, return_inverse=True)[1])
     first = np.unique(components, return_index=True)[1]
     ratios = np.ones(len(first)) if scales is None else scales[own[first]] / scales[own[first[0]]]
-    several = len(first) > 1
+    several, same_world = len(first) > 1, own[first[0]] == 0
     return replace(
         result.taken(rows),
         components=components.astype(np.int32) if several else None,
         map_scales=ratios if several else None,
-        vertical=result.vertical if own[first[0]] == 0 else None,
+        vertical=result.vertical if same_world else None,
+        origin=result.origin if same_world else None,
     )
 
 

@@ -46,6 +46,7 @@ from gsba.types import (
 
 T = TypeVar("T")
 
+CLOSER = "features_closer"  # stage of the features that weak frames get besides
 _NUM_STEPS = 3  # compared, spread over the walk
 _DRIFT_PER_FRAME = 0.13  # times frames over squared matches of a step: the drift of rendered walks
 # of 24 to 48 frames is 0.10 to 0.15 times it; a real one of 11 frames drifts eight times as much
@@ -85,9 +86,9 @@ def adopt(run: Run, stored: Sequence[Path]) -> ObservedFrames:
 def extract_more(state: State, weak: np.ndarray) -> State:
     """More keypoints at some frames (F,) bool, and those of the others as they were."""
     run, before = state.run, state.observed
-    found = _extract(run, _enlarged(run.settings), "features_closer", weak)
+    found = _extract(run, _enlarged(run.settings), CLOSER, weak)
     each = [found if more else old for more, old in zip(weak, before.features, strict=True)]
-    observed = observe(run, "keypoints_closer", each, "features_closer")
+    observed = observe(run, "keypoints_closer", each, CLOSER)
     observed = observed.through(before.cameras)
     return replace(state, observed=observed, map=replace(state.map, observed=observed.shown))
 

@@ -13,7 +13,13 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from gsba.config import CameraSettings, GpsSettings, PlacementSettings
-from gsba.disk import disk_errors, exchange_folders, hold_folder, link_or_copy
+from gsba.disk import (
+    disk_errors,
+    exchange_folders,
+    hold_folder,
+    link_or_copy,
+    with_own_name,
+)
 from gsba.frames.recordings import combine
 from gsba.log import GsbaError
 from gsba.masks.segmentation import Segment
@@ -223,10 +229,12 @@ def add_recordings(
                         f"{f' ({reason})' if reason else ''}: nothing is added; recordings are "
                         "joined where they show the same place, over six frames or more"
                     )
-            if fixed:
-                state = map_joining.hold(state, maps.rows(0))
+            held = None
+            if fixed:  # maps that the recordings join to the largest one move there
+                held = np.flatnonzero(_define_worlds(maps, merged.components)[: maps.starts[1]])
+                state = map_joining.hold(state, held)
             state = map_joining.tie(state, maps.parts)
-            return place.finish(work, state, maps, held=maps.rows(0) if fixed else None)
+            return place.finish(work, state, maps, held=held)
 
 
 @threadpool_limits.wrap(limits=1, user_api="blas")  # sums keep their order
@@ -336,9 +344,9 @@ class _Place:
     def of(cls, root: Path | None, out: Path | str | None) -> "_Place":
         """A place for the result of a run that grows; GsbaError if there is something."""
         if root is not None and (out is None or Path(out).resolve() == root.resolve()):
-            return cls(root)
+            return cls(with_own_name(root))
         assert out is not None
-        out = Path(out)
+        out = with_own_name(Path(out))
         if out.is_symlink() or (out.exists() and not (out.is_dir() and not any(out.iterdir()))):
             raise GsbaError(f"{out} exists: choose another --out")
         if not out.parent.is_dir():
@@ -419,27 +427,10 @@ def _require_any_joined(maps: JointMaps, state: State) -> None:
     )
 
 
-def _write(
-    state: State, maps: JointMaps, held: np.ndarray | None, rigid: RigidMoves | None
-) -> RunResult:
-    """Covariances, and all that a run leaves behind; arguments as of `_Place.finish`."""
-
-    def amended(result: Reconstruction) -> Reconstruction:
-        if maps.rows(0)[0] in result.largest_map():
-            result = replace(result, vertical=maps.runs[0].result.vertical)
-        if held is not None:  # the poses of the first run stay as they were
-            first, poses = maps.runs[0].result, result.world_T_rigs.copy()
-            covariances = result.pose_covariances.copy()
-            poses[held], covariances[held] = first.world_T_rigs, first.pose_covariances
-            changes = {"world_T_rigs": poses, "pose_covariances": covariances}
-            result = replace(result, joint_errors=None, **changes)
-        return result if rigid is None else _with_rigid(result, state, maps, rigid)
-
-    # The poses of each recording that define its map's world: that of the first run in the map
-    components = state.prior.parts
-    if components is None:
-        components = np.zeros(len(state.run.frames), np.int64)
-    sources = np.full(len(components), PoseSource.NONE, np.uint8)
+def _define_worlds(maps: JointMaps, components: np.ndarray) -> np.ndarray:
+    """Frames (F,) bool whose poses before define the worlds of the new maps (F,): those of the
+    largest map of the first run that has any in the new one."""
+    defining = np.zeros(len(components), bool)
     for component in np.unique(components):
         inside = np.flatnonzero(components == component)
         part = maps.parts[inside[0]]
@@ -448,7 +439,30 @@ def _write(
             if np.isin(main, inside).any():
                 part = maps.parts[main[0]]
                 break
-        sources[inside[maps.parts[inside] == part]] = PoseSource.SLAM
+        defining[inside[maps.parts[inside] == part]] = True
+    return defining
+
+
+def _write(
+    state: State, maps: JointMaps, held: np.ndarray | None, rigid: RigidMoves | None
+) -> RunResult:
+    """Covariances, and all that a run leaves behind; arguments as of `_Place.finish`."""
+    components = state.prior.parts
+    if components is None:
+        components = np.zeros(len(state.run.frames), np.int64)
+    sources = np.where(_define_worlds(maps, components), PoseSource.SLAM, PoseSource.NONE)
+
+    def amended(result: Reconstruction) -> Reconstruction:
+        first = maps.runs[0].result
+        if maps.main_rows(0)[0] in result.largest_map():  # in whose world it is then
+            result = replace(result, vertical=first.vertical, origin=first.origin)
+        if held is not None:  # the poses of the first run stay as they were
+            poses, covariances = result.world_T_rigs.copy(), result.pose_covariances.copy()
+            poses[held], covariances[held] = first.world_T_rigs[held], first.pose_covariances[held]
+            changes = {"world_T_rigs": poses, "pose_covariances": covariances}
+            result = replace(result, joint_errors=None, **changes)
+        return result if rigid is None else _with_rigid(result, state, maps, rigid)
+
     poses = np.concatenate([run.result.world_T_rigs for run in maps.runs])
     rows = state.run.frames.recordings.values()
     state = replace(
@@ -456,7 +470,8 @@ def _write(
         prior=replace(
             state.prior,
             of_recordings=tuple(
-                Prior.of(CoarsePoses(poses[own], sources[own], 0.0)) for own in rows
+                Prior.of(CoarsePoses(poses[own], sources[own].astype(np.uint8), 0.0))
+                for own in rows
             ),
         ),
     )

@@ -57,12 +57,7 @@ class ApartError(GsbaError):
 def begin(store: RunStore, maps: JointMaps, settings: RefineSettings) -> State:
     """The state of maps that nothing ties together yet."""
     poses = maps.map.solution.world_T_rigs
-    start = CoarsePoses(
-        poses,
-        np.full(len(poses), PoseSource.SLAM, np.uint8),
-        0.0,
-        origin=maps.runs[0].result.origin,
-    )
+    start = CoarsePoses(poses, np.full(len(poses), PoseSource.SLAM, np.uint8), 0.0)
     families = tuple(inputs.families_of(maps.frames, settings))
     cameras = _settings_of_cameras(maps, start)
     evidence = Evidence(families=families, recordings=cameras, start=RunStart.EARLIER_RUN)

@@ -269,9 +269,7 @@ def _export(
     store, size, images = run.store, run.settings.export.face_size, run.settings.export.images
     fetched = run.settings.export.fetched
     shown_by = seen_by(images, shown, cameras)
-    key = [size, placement.to_json(), *(["of one lens"] if shown_by else [])]
-    key += ["fetched"] if fetched else []
-    key += {"fisheye": ["raw"], "panorama": ["panorama"]}.get(images, [])
+    key = [size, placement.to_json(), images, bool(shown_by), fetched]
     folders = {ExportFormat(name): store.root / name for name in run.settings.export.formats}
     waiting = {}
     for to, folder in folders.items():

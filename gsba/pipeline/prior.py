@@ -100,11 +100,13 @@ class Prior:
         """Coarse poses that define the worlds of the maps.
 
         Of several recordings, each map has the world and scale of its first recording that has a
-        trajectory: poses of the others count as interpolated.
+        trajectory: poses of the others count as interpolated. The origin is that of the largest
+        map's world, number 0.
         """
         coarse, num = self.coarse, len(self.coarse.sources)
         maps = np.zeros(num, np.int64) if self.parts is None else self.parts
         poses, defining = coarse.world_T_rigs.copy(), np.zeros(num, bool)
+        origin = coarse.origin if maps[0] == 0 else None
         begin = 0
         for one in self.of_recordings:
             rows = begin + np.flatnonzero(one.coarse.sources == PoseSource.SLAM)
@@ -114,7 +116,8 @@ class Prior:
                 own = rows[maps[rows] == number]
                 if len(own) >= 3 and not defining[maps == number].any():
                     poses[own], defining[own] = one.coarse.world_T_rigs[own - begin], True
+                    origin = origin if number else one.coarse.origin
             begin += len(one.coarse.sources)
         others = np.isin(maps, maps[defining]) & ~defining
         sources = np.where(others, PoseSource.INTERPOLATED, coarse.sources).astype(np.uint8)
-        return replace(coarse, world_T_rigs=poses, sources=sources)
+        return replace(coarse, world_T_rigs=poses, sources=sources, origin=origin)

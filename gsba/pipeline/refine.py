@@ -491,6 +491,7 @@ def _add_keypoints_where_weak(state: State) -> State:
     """Extract more keypoints at frames that images determine poorly, and adjust."""
     weak = state.prior.weak_frames()
     if state.run.settings.weak_frames.mode == "off" or state.observed.more or not weak.any():
+        state.run.store.forget_frames(frontend.CLOSER)  # of an earlier call, or of lenses before
         return state
     state = frontend.extract_more(state, weak)
     state = frontend.match_along_epipolars(state, "adjacent_closer")

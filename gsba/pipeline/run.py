@@ -139,8 +139,11 @@ class Run:
         if not families.observing_points.members:
             raise GsbaError("factors: no family observes points; add bearing or reprojection")
         paths = [*(path for group in frames.paths for path in group), *frames.mask_paths]
-        start = coarse.world_T_rigs.tolist(), settings.read
-        timing = frames.timestamps.tolist(), frames.timed_of_frame or frames.timed
+        origins = [coarse.origin, *(one.coarse.origin for one in evidence.recordings)]
+        origins = [origin if origin is None else origin.tolist() for origin in origins]
+        start = coarse.world_T_rigs.tolist(), origins, settings.read
+        timed_frames = frames.timed_of_frame or frames.timed
+        timing = frames.timestamps.tolist(), frames.clock_shifts, timed_frames
         inputs = [fingerprint(paths), *timing, *start]
         inputs += [frames.camera_of_frame, *map(asdict, frames.formats), lenses_found]
         store.stage("frames", inputs, lambda: frames, FrameSet)

@@ -104,7 +104,7 @@ def match_places(state: State, found: Recovered) -> State | None:
     run, prior = state.run, state.prior
     tour = _search(state, found)
     if tour is None:  # of an earlier call, whose keypoints have other numbers
-        shutil.rmtree(run.store.root / STAGES / _STAGE, ignore_errors=True)
+        run.store.forget_frames(_STAGE)
         return None
     observed, places = _with_places(state, tour)
     near = replace(tour.near, matches=places)

@@ -242,6 +242,10 @@ class RunStore:
         """Delete the stored result of a stage, so that it is computed again."""
         _stage_path(self.root, name).unlink(missing_ok=True)
 
+    def forget_frames(self, name: str) -> None:
+        """Delete the stored results of a per-frame stage that this call does without."""
+        shutil.rmtree(self.root / STAGES / (self._prefix + name), ignore_errors=True)
+
     def _forget_shards(self) -> None:
         """Delete the shards and the maps in parts of a stage whose result is stored."""
         for path in self.shards_folder.glob("*"):

@@ -104,7 +104,7 @@ def _delay_in_frames(
     for late in range(1 - len(steps), len(steps)):
         theirs = slice(max(late, 0), len(steps) + min(late, 0))
         ours = slice(max(-late, 0), len(steps) - max(late, 0))
-        seen = Steps(found.f_T_nexts[ours], found.verified[ours], found.directed[ours])
+        seen = Steps(found.f_T_nexts[ours], found.verified[ours], found.direction_sigmas[ours])
         both = seen.directed & own[theirs]
         if late == 0 or both.sum() < max(_MIN_STEPS, 0.5 * judged.sum()):
             continue

@@ -123,9 +123,8 @@ def associate_pieces(
     times = np.concatenate([piece.timestamps for piece in pieces])
     poses = np.concatenate([piece.world_T_rigs for piece in pieces])
     coarse = associate(frames, Trajectory(times, poses), settings)
-    coarse = replace(coarse, origin=pieces[0].origin)
     if len(pieces) == 1:
-        return coarse
+        return replace(coarse, origin=pieces[0].origin)
     owners = np.repeat(np.arange(len(pieces)), [len(piece.timestamps) for piece in pieces])
     at = frames.timestamps + coarse.time_offset
     owner = owners[nearest(times, at)]
@@ -136,12 +135,12 @@ def associate_pieces(
         outside = own & ((at < piece.timestamps[0]) | (at > piece.timestamps[-1]))
         sources[outside & (sources == PoseSource.INTERPOLATED)] = PoseSource.EXTRAPOLATED
     used, segments = np.unique(owner, return_inverse=True)
+    origin = pieces[used[0]].origin
+    coarse = replace(coarse, world_T_rigs=world_T_rigs, sources=sources, origin=origin)
     if len(used) == 1:
-        return replace(coarse, world_T_rigs=world_T_rigs, sources=sources)
+        return coarse
     _log.info("the trajectory is in %d pieces, each with a world of its own", len(used))
-    return replace(
-        coarse, world_T_rigs=world_T_rigs, sources=sources, segments=segments.astype(np.int32)
-    )
+    return replace(coarse, segments=segments.astype(np.int32))
 
 
 def _in_turn(pieces: Sequence[Trajectory]) -> list[Trajectory]:

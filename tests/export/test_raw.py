@@ -1,5 +1,6 @@
 """Raw fisheyes of an export: each lens's picture in a file of its own, as trainers read it."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -46,3 +47,19 @@ def test_each_lens_has_a_picture_of_its_own(tmp_path: Path, layout: str) -> None
             assert mask.size == (120, 120)
     linked = layout == "png"
     assert (tmp_path / f"out0.{suffix}").samefile(frames.paths[0][0]) == linked
+
+
+def test_masks_are_the_image_circles_of_each_frames_own_camera(tmp_path: Path) -> None:
+    """Of frames without masks of their own, which share the encoded masks of their camera."""
+    pairs = made_pair(120), made_pair(100)
+    kinds = tuple(PictureFormat("fisheye", 2 * p[0].width, p[0].width, fisheyes=p) for p in pairs)
+    paths = [
+        tuple(write(tmp_path / f"{f}_{n}.png", picture(lens)) for n, lens in enumerate(pair))
+        for f, pair in enumerate(pairs)
+    ]
+    frames = replace(frames_of(kinds[0], paths), formats=kinds, camera_of_frame=(0, 1))
+    files = Files(tmp_path, "01", "out{name}{view}{suffix}", "mask{name}{view}.png")
+    write_pictures(frames, [RawPictures(files)])
+    for f, pair in enumerate(pairs):
+        with Image.open(tmp_path / f"mask{f}0.png") as mask:
+            assert mask.size == (pair[0].width, pair[0].height)

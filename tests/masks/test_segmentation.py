@@ -8,7 +8,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from plain_records import frames_of
 from refusals import refused
+from two_fisheyes import made_pair, picture, write
 
 from gsba.frames.masks import load_mask
 from gsba.frames.scan import scan
@@ -16,7 +18,7 @@ from gsba.log import GsbaError
 from gsba.masks.merging import before, choose
 from gsba.masks.segmentation import Segment, load_segmented, segmented
 from gsba.store.store import RunStore
-from gsba.types import FACES, FrameSet
+from gsba.types import FACES, FrameSet, PictureFormat
 
 WIDTH, NUM = 128, 3
 
@@ -139,3 +141,16 @@ def test_what_is_no_command(tmp_path: Path, frames: FrameSet) -> None:
         refused(message, _run, tmp_path, frames, command)
     with pytest.raises(GsbaError, match=r"mask of f0, front is float64 of shape \(2, 2\)"):
         _run(tmp_path, frames, lambda _: np.ones((2, 2)))
+
+
+def test_raw_fisheyes_are_masked_again_where_another_calibration_cuts_them(tmp_path: Path) -> None:
+    pair, shown = made_pair(64), list[np.ndarray]()
+    paths = [write(tmp_path / f"{n}.png", picture(lens)) for n, lens in enumerate(pair)]
+    for focal in (pair[0].focal, 1.2 * pair[0].focal):
+        lenses = dataclasses.replace(pair[0], focal=focal), pair[1]
+        frames = frames_of(PictureFormat("fisheye", 128, 64, fisheyes=lenses), [tuple(paths)])
+        with RunStore(tmp_path / "run", {"frames": tmp_path}) as store:
+            found = segmented(store, frames, "cp {image} {mask}")
+            assert not store.records["segmented"].resumed
+            shown.append(load_segmented(found, frames, 0))
+    assert np.mean(shown[0] != shown[1]) > 0.02

@@ -5,16 +5,27 @@ import json
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
+import numpy as np
 import pytest
+from plain_records import frames_of
 from pydantic import BaseModel
+from synthetic import loop_walk
 from tiny_run import LIGHT, Case
 
 from gsba import refine
+from gsba.camera.cameras import Cameras
+from gsba.config import CameraSettings, ExportSettings, RefineSettings
 from gsba.config_file import load_config
+from gsba.frames.recordings import combine
+from gsba.pipeline import backend, camera, outputs
+from gsba.pipeline.run import Run
+from gsba.placement.placement import Placement
 from gsba.store import store
-from gsba.store.store import RunStore
+from gsba.store.store import RunStore, load_stage
+from gsba.types import CoarsePoses, FrameSet, PictureFormat
 
 CHANGES = (*LIGHT, "seed=7919", "weak_frames.mode=auto", "export.formats=[]")
 # Results do not depend on threads. Keys have the readout and the stitching radius of a camera
@@ -62,3 +73,72 @@ def test_keys_of_stages_hold_the_settings_that_these_read(
         and (value if name in UNNAMED else f'"{name}": ') not in keys[stage]
     }
     assert not missing and sum(map(len, read.values())) > 30
+
+
+@pytest.mark.parametrize(("clock_s", "origin"), [(1000.0, [0.0, 0, 0]), (0.0, [5e5, 0, 0])])
+def test_clocks_of_recordings_and_the_origin_of_the_world_are_in_keys(
+    clock_s: float, origin: list[float], tmp_path: Path
+) -> None:
+    """Though the times of recordings laid end to end, and poses near the origin, stay the same."""
+    (tmp_path / "0.jpg").touch()
+    kind, paths = PictureFormat("erp", 512, 256), [(tmp_path / "0.jpg",)]
+    frames = combine({"walk": frames_of(kind, paths * 4)})
+    moved = frames_of(kind, paths * 4, times=clock_s + np.arange(4.0))
+    poses, sources = loop_walk(4), np.zeros(4, np.uint8)
+    given = [
+        (frames, CoarsePoses(poses, sources, 0.0, origin=np.zeros(3))),
+        (combine({"walk": moved}), CoarsePoses(poses, sources, 0.0, origin=np.array(origin))),
+    ]
+    for known, coarse in given:
+        with RunStore(tmp_path / "run", {"frames": tmp_path}) as run:
+            Run.begin(run, known, coarse, RefineSettings())
+            assert not run.records["frames"].resumed
+    assert load_stage(tmp_path / "run", "frames", FrameSet).clock_shifts == (-clock_s,) * 4
+
+
+def test_baselines_are_in_keys_of_results_that_depend_on_them() -> None:
+    """How centres are judged depends on whether one is published, and that of several cameras'
+    lenses in the result on the lengths."""
+
+    def keys(*millimetres: float | None) -> str:
+        cameras = tuple(CameraSettings(baseline_mm=one) for one in millimetres)
+        several, kept = cameras if len(cameras) > 1 else (), list[object]()
+        run = SimpleNamespace(
+            frames=SimpleNamespace(formats=cameras),
+            settings=RefineSettings(),
+            camera_settings=several,
+            settings_of=cameras.__getitem__,
+            solving_key=list,
+            stage=lambda name, key, *_: kept.append(key),
+        )
+        nothing, prior = SimpleNamespace(), SimpleNamespace(turning_only=False)
+        state: Any = SimpleNamespace(run=run, prior=prior, map=nothing, solution=nothing)
+        backend.reconstruct(state)
+        return store.digest(camera._settings_of_cameras(state.run), kept)
+
+    assert keys(None) != keys(32.0) == keys(30.0)
+    assert keys(32.0, 28.0) != keys(32.0, 30.0)
+
+
+def test_every_kind_of_exported_images_has_a_key_of_its_own(tmp_path: Path) -> None:
+    """Metashape gets panoramas by default, and faces on request."""
+    frames = frames_of(PictureFormat("erp", 512, 256), [(tmp_path / "0.jpg",)])
+
+    def key(**settings: Any) -> object:
+        kept = list[object]()
+        folder = SimpleNamespace(
+            root=tmp_path,
+            forget=lambda _: None,
+            stored=lambda *given: kept.append(given[1]),
+            stage=lambda *_: None,
+            claim=lambda _: None,
+        )
+        export = ExportSettings(formats=("metashape",), **settings)
+        chosen = RefineSettings(export=export)
+        run: Any = SimpleNamespace(store=folder, settings=chosen, latest=[])
+        outputs._export(run, cast(Any, None), frames, Placement(), Cameras.plain(frames))
+        return kept
+
+    given: list[dict[str, Any]] = [{}, {"images": "cube"}, {"fetched": True}, {"face_size": 64}]
+    keys = [store.digest(key(**settings)) for settings in given]
+    assert len({*keys}) == len(given) and keys[0] == store.digest(key())

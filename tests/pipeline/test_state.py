@@ -1,8 +1,16 @@
-"""Matches that the state of a run hands on."""
+"""Matches that the state of a run hands on, and features that it leaves."""
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
+import pytest
 
+from gsba.config import RefineSettings
+from gsba.pipeline.refine import _add_keypoints_where_weak
 from gsba.pipeline.state import MapMatches
+from gsba.store.store import RunStore
 from gsba.types import Matches
 
 
@@ -26,3 +34,20 @@ def test_matches_between_parts_are_dropped_where_parts_were_found_apart() -> Non
     assert within.known_points is not None and len(within.known_points.pairs) == 0
     assert within.across is None and within.loops is loops
     assert MapMatches(found.neighbours).within(parts).known_points is None
+
+
+@pytest.mark.parametrize("prefix", ["", "first-"])
+def test_features_of_weak_frames_go_where_no_frame_is_weak(prefix: str, tmp_path: Path) -> None:
+    """Those of an earlier call, or of lenses before these were calibrated, would be read for the
+    frames' own when pictures are localised."""
+    stages = [tmp_path / "run" / "stages" / f"{name}features_closer" for name in ("", "first-")]
+    with RunStore(tmp_path / "run", {"frames": tmp_path}) as store:
+        for stage in stages:
+            stage.mkdir(parents=True)
+            (stage / "0.npz").touch()
+        store._prefix = prefix
+        run = SimpleNamespace(store=store, settings=RefineSettings())
+        prior = SimpleNamespace(weak_frames=lambda: np.zeros(3, bool))
+        state: Any = SimpleNamespace(run=run, prior=prior, observed=SimpleNamespace(more=False))
+        assert _add_keypoints_where_weak(state) is state
+    assert [stage.exists() for stage in stages] == [prefix != "", prefix == ""]

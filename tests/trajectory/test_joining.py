@@ -1,5 +1,6 @@
 """Pieces of a trajectory: found where a map was begun anew, and laid into one world."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -95,6 +96,18 @@ def test_where_pieces_overlap_the_earlier_leads() -> None:
     inside = [pieces[0], Trajectory(TIMES[10:20], other[10:20])]
     alone = associate_pieces(_frames(25), inside, ReadSettings())
     assert alone.segments is None
+
+
+def test_the_origin_is_that_of_the_first_piece_with_frames() -> None:
+    origins = np.array([[5e5, 0.0, 0.0], [6e5, 0.0, 0.0]])
+    pieces = [
+        Trajectory(TIMES + shift, TRUTH, origin)
+        for shift, origin in zip((-100.0, 0.0), origins, strict=True)
+    ]
+    for piece in pieces:
+        frames = replace(_frames(), timestamps=piece.timestamps)
+        coarse = associate_pieces(frames, pieces, ReadSettings())
+        assert coarse.segments is None and coarse.origin is piece.origin
 
 
 def test_a_piece_is_placed_as_if_the_pace_went_on() -> None:

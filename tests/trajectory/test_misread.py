@@ -86,15 +86,18 @@ def test_a_late_clock_or_another_recording_are_not_misread() -> None:
     refused("reversed in time", refuse_misread, _coarse(SLAM[::-1]), _found(), TwoViewLimits())
 
 
-@pytest.mark.parametrize("late", [12, -13])
-def test_the_other_side_of_a_loop_is_another_clock(late: int) -> None:
-    """Without turning, half a loop away every step goes the other way, as in inverted poses."""
+@pytest.mark.parametrize(("late", "standing"), [(12, 0.0), (-13, 0.0), (12, 0.4)])
+def test_the_other_side_of_a_loop_is_another_clock(late: int, standing: float) -> None:
+    """Without turning, half a loop away every step goes the other way, as in inverted poses;
+    `standing`: share of steps whose direction images leave open."""
     truth = loop_walk(NUM)
     truth[:, :3, :3] = np.eye(3)
     steps = inverse(truth[:-1]) @ truth[1:]
     steps[:, :3, 3] = unit(steps[:, :3, 3])
-    every = np.ones(NUM - 1, bool)
-    found, ahead = Steps(steps, every, every), np.arange(NUM) + late
+    stands = np.arange(NUM - 1) % 10 < 10 * standing
+    steps[stands, :3, 3] = [0.0, 1.0, 0.0]
+    found = Steps(steps, np.ones(NUM - 1, bool), np.where(stands, np.inf, 0.01))
+    ahead = np.arange(NUM) + late
     sources = np.where((ahead >= 0) & (ahead < NUM), PoseSource.SLAM, PoseSource.EXTRAPOLATED)
     poses = CoarsePoses(truth[ahead.clip(0, NUM - 1)], sources.astype(np.uint8), 0.0)
     refuse_misread(poses, found, TwoViewLimits())
