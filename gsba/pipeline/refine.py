@@ -355,7 +355,7 @@ def _solve_raw(run: Run) -> State:
     known += [] if evidence.imu is None else [evidence.imu.digest]
     counts, frames = dict(run.journal.counts), run.frames
     n, best = 0, None  # the pass before: the stage it rests on, number of steps without matches,
-    # state
+    # state, records of its stages
     while True:
         name, after, better = f"recut{n}", list(run.latest), None
         kept = run.store.stored(f"{name}_undone", known, bool, after)
@@ -377,9 +377,16 @@ def _solve_raw(run: Run) -> State:
                 unseen = int(state.prior.trust.unseen_steps.sum())
                 if best is not None and unseen > best[1]:
                     logger.info("frames cut anew match at fewer steps: the pass before is kept")
-                    run.store.stage(f"recut{n - 1}_undone", known, lambda: True, bool, best[0])
-                    return best[2]
-                best, last = (after, unseen, state), bool(kept) or n == 2
+                    before, _, state, records = best
+                    own = state.run  # which further stages, and later runs, rest on again
+                    given = own.frames, run.coarse, run.settings, evidence
+                    Run.begin(run.store, *given, lenses_found=own.lenses_found)
+                    run.store.records.update(records)
+                    run.store.stage(f"recut{n - 1}_undone", known, lambda: True, bool, before)
+                    for frame, found in zip(frames.names, state.observed.features, strict=True):
+                        found[frame]
+                    return state
+                best, last = (after, unseen, state, dict(run.store.records)), bool(kept) or n == 2
                 better = None if last else camera.better_calibration(run.coarse, state.map)
                 if better is None:
                     return state

@@ -1,0 +1,51 @@
+"""Raw pairs that are cut anew by their own calibration, pass after pass."""
+
+import importlib
+from collections import defaultdict
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from plain_records import frames_of
+from synthetic import loop_walk
+from two_fisheyes import made_pair, picture, write
+
+from gsba.config import RefineSettings
+from gsba.pipeline.run import Run
+from gsba.store.store import RunStore, load_stage
+from gsba.types import CoarsePoses, FrameSet, PictureFormat
+
+
+def test_a_pass_that_is_kept_is_kept_in_later_calls(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where frames cut anew match at fewer steps, with all that rests on its stages."""
+    module = importlib.import_module("gsba.pipeline.refine")
+    pair, found = made_pair(64), list[Any]()
+    paths = [write(tmp_path / f"{n}.png", picture(lens)) for n, lens in enumerate(pair)]
+    frames = frames_of(PictureFormat("fisheye", 128, 64, fisheyes=pair), [tuple(paths)] * 3)
+    coarse = CoarsePoses(loop_walk(3), np.zeros(3, np.uint8), 0.0)
+    better = (replace(pair[0], focal=1.1 * pair[0].focal), pair[1])
+
+    def solved(run: Run) -> Any:
+        unseen = np.full(2, run.frames.format.fisheyes == better)
+        prior = SimpleNamespace(trust=SimpleNamespace(unseen_steps=unseen))
+        features = [defaultdict(lambda: found.append(run.frames.format))] * 3
+        observed = SimpleNamespace(features=features)
+        return SimpleNamespace(run=run, prior=prior, map=None, observed=observed)
+
+    monkeypatch.setattr(module.frontend, "extract", lambda run: run)
+    monkeypatch.setattr(module, "solve", solved)
+    monkeypatch.setattr(module.camera, "better_calibration", lambda *_: ((better, True),))
+    monkeypatch.setattr(module.merging, "recut", lambda _, frames, __: frames)
+    for _ in range(2):
+        with RunStore(tmp_path / "run", {"frames": tmp_path}) as store:
+            run = Run.begin(store, frames, coarse, RefineSettings())
+            first = store.records["frames"].key
+            assert module._solve_raw(run).run.frames.format.fisheyes == pair
+            assert store.records["frames"].key == first
+        assert load_stage(tmp_path / "run", "frames", FrameSet).format.fisheyes == pair
+    assert found == [frames.format] * 3  # its features are stored again
