@@ -29,6 +29,7 @@ from gsba.pipeline.prior import Prior
 from gsba.pipeline.run import Run
 from gsba.pipeline.state import State
 from gsba.similarity import Sim3
+from gsba.store.store import RunStore
 from gsba.types import (
     CoarsePoses,
     Counts,
@@ -192,3 +193,19 @@ def test_a_readout_is_not_made_of_motion_from_one_recording_to_another(tmp_path:
     assert motion is not None and not motion[:12].any()
     step = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).mean()
     assert np.allclose(np.linalg.norm(motion[12:, 3:], axis=1), 0.02 * step, rtol=0.1)
+
+
+def test_pictures_that_changed_since_a_call_was_interrupted_are_taken_again(tmp_path: Path) -> None:
+    """Extracted anew from the run's video, under the names that they had."""
+    frames, first = _frames({"walk": 2}), tmp_path / "first"
+    (first / "frames").mkdir(parents=True)
+    paths = [(first / "frames" / f"{f}.jpg",) for f in range(2)]
+    frames = replace(frames, paths=tuple(paths))
+    for content in ("before", "after"):
+        for (path,) in paths:
+            path.unlink(missing_ok=True)
+            path.write_text(content)
+        with RunStore(tmp_path / "run", {"frames": tmp_path}) as store:
+            store.stage("frames", [content], lambda: frames, FrameSet)
+            (kept,) = growing.complete(store, frames, [first, store.root], store.root).paths[1]
+        assert kept.read_text() == content and tmp_path / "run" in kept.parents
