@@ -97,8 +97,7 @@ def complete(store: RunStore, frames: FrameSet, sources: Sequence[Path], out: Pa
         if not any(root in own.parents for root in roots):
             return path
         name = Path(folder) / frame.rpartition("/")[0] / lens / path.name
-        if not (store.root / name).is_file():
-            link_or_copy(own, store.root / name)
+        link_or_copy(own, store.root / name)
         return out.absolute() / name
 
     paths, masks = [], []

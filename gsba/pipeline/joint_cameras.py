@@ -10,7 +10,7 @@ from gsba.bundle.found_camera import FoundCamera
 from gsba.bundle.readout import CameraEstimate, velocities
 from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.config import CameraSettings
-from gsba.frames.recordings import one_mode, own_timestamps
+from gsba.frames.recordings import one_mode
 from gsba.log import GsbaError
 from gsba.pipeline.finished_run import FinishedRun
 from gsba.similarity import Sim3
@@ -81,7 +81,7 @@ class JointCameras:
     ) -> tuple[FoundCamera, ...]:
         """Estimate of each camera (C,) for the frames of all runs, which `moves` place in the joint
         one."""
-        times, poses = own_timestamps(frames), solution.world_T_rigs
+        times, poses = frames.timestamps, solution.world_T_rigs
         starts = np.cumsum([0, *(len(run.frames) for run in runs)])
 
         def estimate(camera: int, known: FoundCamera) -> CameraEstimate | None:
@@ -96,7 +96,9 @@ class JointCameras:
                 if found.lenses.readout_motion is not None:
                     moved = None if c is None else lenses.scaled(move.scale).readout_motion
                     if moved is None:  # the run did not find it
-                        moved = found.readout_s * velocities(poses[rows], times[rows])
+                        maps = run.result.components
+                        rates = velocities(poses[rows], times[rows], maps=maps)
+                        moved = found.readout_s * rates
                     motion.append(moved)
                 straight = np.tile(np.eye(3), (len(rows), 1, 1))
                 axes.append(straight if lenses.axes is None else lenses.axes)

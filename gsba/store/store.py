@@ -222,12 +222,10 @@ class RunStore:
         as results of this one; computed where a file is missing."""
         folder, keys = self.root / STAGES / name, {}
         for frame, source in files.items():
-            path = folder / f"{frame}.npz"
-            if source.is_file() and not path.is_file():
+            path, known = folder / f"{frame}.npz", _stored_key(source)
+            if known is not None and known != _stored_key(path):
                 link_or_copy(source, path)
-            with suppress(RecordError):
-                keys[frame] = str(read_info(path).get("key"))
-            keys.setdefault(frame, digest(__version__, FORMAT, name, frame))
+            keys[frame] = _stored_key(path) or digest(__version__, FORMAT, name, frame)
         return PerFrame(folder, keys, compute, returns)
 
     def stored(
@@ -427,6 +425,13 @@ def _named_in_memory_errors(stage: str) -> Iterator[None]:
 
 def _stage_path(root: Path, name: str) -> Path:
     return root / STAGES / f"{name}.npz"
+
+
+def _stored_key(path: Path) -> str | None:
+    """Key that a record was stored with; None if it cannot be read."""
+    with suppress(RecordError):
+        return str(read_info(path).get("key"))
+    return None
 
 
 def _load_if_current(path: Path, key: str, returns: type[T]) -> tuple[T, StageRecord] | None:

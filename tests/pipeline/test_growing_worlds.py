@@ -13,16 +13,23 @@ from plain_records import frames_of, map_of
 from synthetic import loop_walk, make_world
 
 from gsba import Recording
+from gsba.bundle.found_camera import FoundCamera
+from gsba.bundle.lens_centres import LensCentres
+from gsba.bundle.readout import CameraEstimate
+from gsba.camera.lens import Lenses
 from gsba.config import CameraSettings, RefineSettings
+from gsba.frames.recordings import combine
 from gsba.pipeline import growing
 from gsba.pipeline.each_recording import joined_poses
 from gsba.pipeline.finished_run import FinishedRun
+from gsba.pipeline.joint_cameras import JointCameras
 from gsba.pipeline.joint_map import JointMaps
 from gsba.pipeline.map import Map
 from gsba.pipeline.prior import Prior
 from gsba.pipeline.run import Run
 from gsba.pipeline.state import State
 from gsba.similarity import Sim3
+from gsba.store.store import RunStore
 from gsba.types import (
     CoarsePoses,
     Counts,
@@ -160,6 +167,45 @@ def test_a_run_grows_where_it_is_the_current_folder(
     (tmp_path / "run" / "stages").mkdir(parents=True)
     monkeypatch.chdir(tmp_path / "run")
     assert growing._Place.of(place, None).out == tmp_path / "run"
-    fails(
-        run_gsba("localize", tmp_path / "other", place), "is not a gsba run"
-    )  # pictures of this folder
+    found = run_gsba("localize", tmp_path / "other", place)  # pictures of this folder
+    fails(found, "is not a gsba run")
+
+
+def test_a_readout_is_not_made_of_motion_from_one_recording_to_another(tmp_path: Path) -> None:
+    """Of a run that did not find it, whose recordings' clocks show the same times."""
+    poses, still, shown = loop_walk(24), Lenses(np.array([0.0, 0, 0.01])), dict[str, FrameSet]()
+    for name, num in {"a": 12, "b": 6, "c": 6}.items():
+        paths = [(tmp_path / f"{name}{f}.jpg",) for f in range(num)]
+        for (path,) in paths:
+            path.write_text(path.name)
+        shown[name] = frames_of(PictureFormat("erp", 512, 256), paths)
+    rolling = replace(still, row_directions=np.eye(3)[:2], readout_motion=np.zeros((12, 6)))
+    runs = list[Any]()
+    for lenses in (rolling, still):
+        given = lenses.centre, np.eye(3), np.zeros(0), "", Counts(0, 0, "observations")
+        camera = FoundCamera(LensCentres(lenses, *given), readout=CameraEstimate(lenses, 0.02))
+        known = {"map": SimpleNamespace(cameras=(camera,)), "frames": range(12)}
+        runs.append(SimpleNamespace(result=SimpleNamespace(components=None), **known))
+    frames = combine(shown)
+    joint = JointCameras(frames.formats, (CameraSettings(),), ((0,), (0,)), (0,))
+    (found,) = joint.found(runs, (Sim3(), Sim3()), Solution.without_points(poses), frames)
+    motion = found.lenses.readout_motion
+    assert motion is not None and not motion[:12].any()
+    step = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).mean()
+    assert np.allclose(np.linalg.norm(motion[12:, 3:], axis=1), 0.02 * step, rtol=0.1)
+
+
+def test_pictures_that_changed_since_a_call_was_interrupted_are_taken_again(tmp_path: Path) -> None:
+    """Extracted anew from the run's video, under the names that they had."""
+    frames, first = _frames({"walk": 2}), tmp_path / "first"
+    (first / "frames").mkdir(parents=True)
+    paths = [(first / "frames" / f"{f}.jpg",) for f in range(2)]
+    frames = replace(frames, paths=tuple(paths))
+    for content in ("before", "after"):
+        for (path,) in paths:
+            path.unlink(missing_ok=True)
+            path.write_text(content)
+        with RunStore(tmp_path / "run", {"frames": tmp_path}) as store:
+            store.stage("frames", [content], lambda: frames, FrameSet)
+            (kept,) = growing.complete(store, frames, [first, store.root], store.root).paths[1]
+        assert kept.read_text() == content and tmp_path / "run" in kept.parents

@@ -497,3 +497,16 @@ def test_stages_that_are_computed_again_cost_their_time_twice(tmp_path: Path) ->
         assert store.seconds_again == 0
         store.stage("one", 1, _tracks, Tracks)
         assert store.seconds_again == first > 0
+
+
+def test_records_of_another_run_are_taken_again_where_it_has_others_now(tmp_path: Path) -> None:
+    source, taken = tmp_path / "source.npz", list[int]()
+    for number in (1, 2, 2):
+        save_record(source, number, {"key": f"settings {number}"})
+        with RunStore(tmp_path / "run", {"frames": tmp_path}) as store:
+            taken.append(store.adopt("features", {"0": source}, lambda _: 0, int)["0"])
+    source.unlink()  # what was taken stays
+    with RunStore(tmp_path / "run", {"frames": tmp_path}) as store:
+        files = {"0": source, "1": source}
+        found = store.adopt("features", files, lambda _: 7, int)
+        assert (taken, found["0"], found["1"]) == ([1, 2, 2], 2, 7)
