@@ -62,12 +62,14 @@ def _chosen_by_odometry(
     """Trajectory file beside the folder of frames, with the poses of frames that odometry chose."""
     from gsba import odometry
     from gsba.config_file import validated
+    from gsba.disk import with_own_name
     from gsba.frames.files import EXTRACTED
     from gsba.odometry.walk import write_chosen
     from gsba.trajectory.files import read_trajectory
     from gsba.video import check_video
 
-    path = out.with_name(f"{out.name}.tum")
+    named = with_own_name(out)
+    path = named.with_name(f"{named.name}.tum")
     if path.is_file() and (out / EXTRACTED).is_file() and not fresh:  # chosen before
         if frames is not None and len(read_trajectory(path).timestamps) > frames:
             raise GsbaError(

@@ -317,6 +317,8 @@ def test_a_black_video_is_refused_before_it_is_followed(
     assert done.exit_code == 1 and "its frames are black" in done.stderr, done.stderr
     chosen = "extract", video, "--out", tmp_path / "frames", "--every", "auto"
     fails(run_gsba(*chosen), "its frames are black")
+    monkeypatch.chdir(tmp_path)
+    fails(run_gsba(*chosen[:3], ".", *chosen[4:]), "its frames are black")
     fails(run_gsba(*chosen, "--width", 512), f"--width 512: {video} has only {WIDTH} pixels")
     fails(run_gsba(*chosen, "--sharpest"), "--every auto keeps sharp frames already")
 
