@@ -449,7 +449,8 @@ def _write(
     components = state.prior.parts
     if components is None:
         components = np.zeros(len(state.run.frames), np.int64)
-    sources = np.where(_define_worlds(maps, components), PoseSource.SLAM, PoseSource.NONE)
+    defining = _define_worlds(maps, components)
+    sources = np.where(defining, PoseSource.SLAM, PoseSource.NONE).astype(np.uint8)
 
     def amended(result: Reconstruction) -> Reconstruction:
         first = maps.runs[0].result
@@ -469,8 +470,7 @@ def _write(
         prior=replace(
             state.prior,
             of_recordings=tuple(
-                Prior.of(CoarsePoses(poses[own], sources[own].astype(np.uint8), 0.0))
-                for own in rows
+                Prior.of(CoarsePoses(poses[own], sources[own], 0.0)) for own in rows
             ),
         ),
     )

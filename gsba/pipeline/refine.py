@@ -378,13 +378,14 @@ def _solve_raw(run: Run) -> State:
                 if best is not None and unseen > best[1]:
                     logger.info("frames cut anew match at fewer steps: the pass before is kept")
                     before, _, state, records = best
-                    own = state.run  # which further stages, and later runs, rest on again
-                    given = own.frames, run.coarse, run.settings, evidence
-                    Run.begin(run.store, *given, lenses_found=own.lenses_found)
+                    # Frames, stages and features on disk become those of the pass that is kept
+                    passed = state.run
+                    given = passed.frames, run.coarse, run.settings, evidence
+                    Run.begin(run.store, *given, lenses_found=passed.lenses_found)
                     run.store.records.update(records)
                     run.store.stage(f"recut{n - 1}_undone", known, lambda: True, bool, before)
-                    for frame, found in zip(frames.names, state.observed.features, strict=True):
-                        found[frame]
+                    for frame, features in zip(frames.names, state.observed.features, strict=True):
+                        features[frame]
                     return state
                 best, last = (after, unseen, state, dict(run.store.records)), bool(kept) or n == 2
                 better = None if last else camera.better_calibration(run.coarse, state.map)

@@ -1,4 +1,4 @@
-"""Whether GPS fixes fit a run's path better at other times, or mirrored, by a likelihood ratio.
+"""Likelihood ratio tests of GPS fixes: of another clock offset, and of a mirrored run.
 
 Both are fitted by similarities under Student's distribution of whitened errors, whose scale is
 fitted, too: files claim more or less noise than fixes have.

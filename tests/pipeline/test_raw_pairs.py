@@ -52,12 +52,8 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for f, pose in enumerate(truth.world_T_rigs):
             at = pose.copy()
             at[:3, 3] += side * 0.5 * BASELINE * pose[:3, 2]
-            erp = render_erp(scene, at, 1024, 512).clip(0, 255).astype(np.uint8)
-            picture = cv2.remap(erp, maps[0], maps[1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_WRAP)
-            picture[np.isnan(maps[0])] = 0
-            cv2.imwrite(str(folder / "frames" / name / f"{f:04d}.png"), picture[..., ::-1])
-    rows = [f"{f:04d},{time!r}" for f, time in enumerate(truth.timestamps.tolist())]
-    (folder / "frames/timestamps.csv").write_text("\n".join(rows))
+            _write_picture(folder / "frames" / name, f, render_erp(scene, at, 1024, 512), maps)
+    _write_times(folder / "frames", truth)
     write_tum(folder / "truth.tum", truth)
     write_tum(folder / "slam.tum", degrade(truth, 0))
     _write(folder / "true.json", LENSES)
@@ -73,6 +69,19 @@ def _maps(lens: Fisheye) -> np.ndarray:
     maps = np.moveaxis(erp_from_bearings(directions, 1024, 512) - 0.5, -1, 0).astype(np.float32)
     maps[:, directions @ rotation_of(lens)[:, 2] < np.cos(np.deg2rad(100))] = np.nan
     return maps
+
+
+def _write_picture(folder: Path, frame: int, erp: np.ndarray, maps: np.ndarray) -> None:
+    """A lens's picture, cut from a panorama at places by `_maps`."""
+    pixels = erp.clip(0, 255).astype(np.uint8)
+    picture = cv2.remap(pixels, maps[0], maps[1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_WRAP)
+    picture[np.isnan(maps[0])] = 0
+    cv2.imwrite(str(folder / f"{frame:04d}.png"), picture[..., ::-1])
+
+
+def _write_times(folder: Path, truth: Trajectory) -> None:
+    rows = [f"{f:04d},{time!r}" for f, time in enumerate(truth.timestamps.tolist())]
+    (folder / "timestamps.csv").write_text("\n".join(rows))
 
 
 def _write(path: Path, pair: Pair) -> None:
@@ -228,12 +237,8 @@ def test_six_frames_tell_rows_read_one_after_another(readout_s: float, tmp_path:
             eyes = poses.copy()
             eyes[:, :, 3] += side * 0.5 * BASELINE * poses[:, :, 2]
             eye = Eye(eyes, side, (0.0, 1.0), np.deg2rad(100), BEND[:2], -0.2)
-            erp = render_eye(scene, eye, 1024, 512).clip(0, 255).astype(np.uint8)
-            picture = cv2.remap(erp, maps[0], maps[1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_WRAP)
-            picture[np.isnan(maps[0])] = 0
-            cv2.imwrite(str(tmp_path / "frames" / name / f"{f:04d}.png"), picture[..., ::-1])
-    rows = [f"{f:04d},{time!r}" for f, time in enumerate(truth.timestamps.tolist())]
-    (tmp_path / "frames/timestamps.csv").write_text("\n".join(rows))
+            _write_picture(tmp_path / "frames" / name, f, render_eye(scene, eye, 1024, 512), maps)
+    _write_times(tmp_path / "frames", truth)
     _write(tmp_path / "true.json", LENSES)
     given = tmp_path / "frames", None, tmp_path / "run", RAW_SETTINGS
     result = refine(*given, calibration=tmp_path / "true.json")

@@ -97,8 +97,8 @@ def test_clocks_of_recordings_and_the_origin_of_the_world_are_in_keys(
 
 
 def test_baselines_are_in_keys_of_results_that_depend_on_them() -> None:
-    """How centres are judged depends on whether one is published, and that of several cameras'
-    lenses in the result on the lengths."""
+    """Lens centres depend on whether a baseline is published; the result of several cameras
+    depends on its length."""
 
     def keys(*millimetres: float | None) -> str:
         cameras = tuple(CameraSettings(baseline_mm=one) for one in millimetres)
