@@ -99,10 +99,12 @@ def measure(report: Mapping[str, Any], main: Reconstruction, shown: FrameSet) ->
 
 def _position_error(main: Reconstruction) -> float:
     """Length, map units, by which no refined position is further off in 19 of 20 maps."""
-    if main.joint_errors is None:
-        return math.nan
-    errors = position_errors(main.world_T_rigs, main.joint_errors.draws)
     refined = main.pose_statuses == PoseStatus.REFINED  # others are a reason of their own
+    if main.joint_errors is None:  # a part was held or moved as it is: covariances bound errors
+        squares = np.trace(main.pose_covariances[refined, 3:, 3:], axis1=1, axis2=2)
+        squares = squares[np.isfinite(squares)]
+        return _ERROR_RATIO * 2 * float(np.sqrt(squares.max())) if len(squares) else math.nan
+    errors = position_errors(main.world_T_rigs, main.joint_errors.draws)
     errors = errors[:, refined & np.isfinite(errors).all(axis=0)]
     if not errors.size:
         return math.nan
@@ -448,6 +450,10 @@ class _Tests:
     def _uncertain(self) -> Iterator[Reason]:
         """Positions that the images hold too loosely."""
         error = self.figures.position_error
+        if math.isnan(error):
+            cause = "how far positions may be off is not known: they have no covariances"
+            remedy = "compare places that you passed twice; give more frames, further apart"
+            yield Reason(Level.LOOK, (), cause, remedy, command=_LOOK_AROUND)
         if error > MAX_POSITION_ERROR:
             level = Level.REFUSED if error > MAX_UNSHARP_ERROR else Level.LOOK
             cause = f"positions may be off by {100 * error:.2g} % of the path's extent"

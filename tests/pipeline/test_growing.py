@@ -225,6 +225,7 @@ def test_rigid_merging_keeps_both_maps_and_tells_how_sure_it_is(
     kept = replace(kept, order_doubted=True, lone_steps=(("000003", "000004"),))
     save_record(doubted / STAGES / "map.npz", kept, {})
     result = merge_runs([home.run, doubted], tmp_path / "run", rigid=True)
+    assert result.report["verdict"]["figures"]["position_error"] < 0.01
     reasons = result.report["verdict"]["reasons"]  # those of the second run, too
     assert any("hardly more alike than any two" in reason["cause"] for reason in reasons)
     (lone,) = (reason for reason in reasons if "own two frames alone" in reason["cause"])

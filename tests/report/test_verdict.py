@@ -6,9 +6,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+from walk_on_earth import walk_result
 
-from gsba.report.verdict import Figures, Level, Verdict, _smaller_sides, verdict_on
-from gsba.types import RunStart
+from gsba.report.verdict import (
+    Figures,
+    Level,
+    Verdict,
+    _position_error,
+    _smaller_sides,
+    verdict_on,
+)
+from gsba.types import JointErrors, PoseStatus, RunStart
 
 NUM = 20
 NAMES = tuple(f"{n:03d}" for n in range(NUM))
@@ -177,6 +185,7 @@ def test_lengths_are_metres_where_the_scale_is_known_and_the_camera_is_named() -
         ),
         ({"position_error": 0.02}, Level.LOOK, "", "may be off by 2 % of the path's extent"),
         ({"position_error": 0.2}, Level.REFUSED, "", "may be off by 20 % of the path's extent"),
+        ({"position_error": math.nan}, Level.LOOK, "", "may be off is not known"),
         ({"deviations": (0.3, *(0.0,) * 18)}, Level.LOOK, "000 001", "contradict 1 of 19 steps"),
         ({"overlaps": (0.9, 0.3, 0.9)}, Level.LOOK, "001 002", "both frames of 1 of 19 steps"),
         ({"deviations": (0.3,) * 19}, Level.REFUSED, None, "contradict 19 of 19 steps"),
@@ -258,3 +267,15 @@ def test_many_frames_are_counted_in_a_line() -> None:
 def test_a_change_of_scale_moves_the_smaller_side_of_a_walk() -> None:
     walk = np.column_stack([np.arange(5.0), [0.0, 0.0, 0.0, 0.0, 3.0], np.zeros(5)])
     np.testing.assert_allclose(_smaller_sides(walk), [0.0, 1.0, 2.0, 0.0], rtol=1e-12)
+
+
+def test_without_a_joint_distribution_covariances_bound_positions() -> None:
+    sigma, walk = 0.01, walk_result()
+    num, rng = len(walk.world_T_rigs), np.random.default_rng(2)
+    covariances = np.tile(np.eye(6) * sigma**2, (num, 1, 1))
+    statuses = np.full(num, PoseStatus.REFINED)
+    own = replace(walk, pose_covariances=covariances, pose_statuses=statuses)
+    draws = rng.normal(0, sigma, (400, num, 6)).astype(np.float32)
+    joint = replace(own, joint_errors=JointErrors(np.zeros((num - 1, 6, 6)), draws))
+    assert 0.8 * _position_error(joint) < _position_error(own) < 2 * _position_error(joint)
+    assert math.isnan(_position_error(replace(own, pose_covariances=covariances * math.nan)))
