@@ -20,7 +20,7 @@ from gsba.export.split import require_held_out
 from gsba.log import GsbaError, brief
 from gsba.placement.placement import Placement
 from gsba.similarity import Sim3
-from gsba.store.finished import cameras_of_map, one_map
+from gsba.store.finished import cameras_of_map, map_digest, one_map
 from gsba.store.shards import Workers, content_digest
 from gsba.store.store import fingerprint
 from gsba.types import FrameSet, PoseStatus, Reconstruction
@@ -86,6 +86,7 @@ def export_all(
     whole = reconstruction
     cameras = Cameras.of(options.lenses, frames)
     reconstruction, frames = one_map(whole, frames, map_number, "the reconstruction")
+    exported = map_digest(reconstruction, frames)
     cameras = cameras_of_map(cameras, whole, map_number)
     # Frames (F',) int64 of a map that an export holds.
     for name in options.without:
@@ -121,7 +122,7 @@ def export_all(
     writers: list[FrameWriter] = []
     with ExitStack() as folders:
         for to, out in outs.items():
-            folder = output_folder(out, to.value, content_digest(to.value, *key))
+            folder = output_folder(out, to.value, exported, content_digest(to.value, *key))
             partial = folders.enter_context(folder)
             datasets.append(partial)
             writers += _write_dataset(partial, unplaced, frames, to, placement, seen_by, options)

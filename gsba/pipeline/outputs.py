@@ -1,6 +1,7 @@
 """What a run leaves behind: poses, cloud, datasets and the report."""
 
 import json
+import logging
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from gsba.camera.cameras import Cameras
 from gsba.config_file import to_toml
 from gsba.disk import write_json, write_text
 from gsba.export import ExportFormat, ExportOptions, export_all, seen_by, write_points
+from gsba.export.folder import datasets_of_other_maps
 from gsba.frames.recordings import names_of_cameras, own_timestamps
 from gsba.log import GsbaError
 from gsba.pipeline.prior import Prior
@@ -29,9 +31,12 @@ from gsba.report.html import residual_sphere, write_html
 from gsba.report.maps import MapSummary, is_partial, summarize_maps
 from gsba.report.report import Findings, StageLog, build_report, plain, write_poses
 from gsba.report.verdict import Level
+from gsba.store.finished import map_digest, one_map
 from gsba.store.store import RunStore
 from gsba.trajectory.files import write_tum
 from gsba.types import CoarsePoses, Counts, FrameSet, Reconstruction, RunStart, Trajectory
+
+logger = logging.getLogger(__name__)
 
 CALIBRATION = "calibration.json"
 TRAJECTORIES = "trajectories"  # folder of a trajectory file for each of several recordings
@@ -93,6 +98,7 @@ def write(state: State, result: Reconstruction, cameras: Cameras) -> RunResult:
     baseline = settings.camera.baseline()
     placement = place(main, shown, settings.placement, baseline, settings.gps)
     _export(run, main, shown, placement, cameras.taken(rows))
+    _warn_of_datasets_before(out, result, frames)
     report = _report(state, result)
     write_json(out / "report.json", report)
     page = report | {"frames": [report["frames"][f] for f in rows]}
@@ -178,6 +184,21 @@ def _report(state: State, result: Reconstruction) -> dict[str, Any]:
         report["cameras"] = every
     report["residual_sphere"] = plain(residual_sphere(result), digits=4)
     return report
+
+
+def _warn_of_datasets_before(out: Path, result: Reconstruction, frames: FrameSet) -> None:
+    """Warn of datasets in the run's folder that hold a map of an earlier call."""
+    maps = range(1, result.num_maps + 1)
+    digests = {map_digest(*one_map(result, frames, number, str(out))) for number in maps}
+    for name, to in datasets_of_other_maps(out, digests).items():
+        logger.warning(
+            "%s holds a map of an earlier call: write it anew (gsba export %s --to %s --out %s), "
+            "or delete it",
+            out / name,
+            out,
+            to,
+            out / name,
+        )
 
 
 def _findings(state: State, result: Reconstruction, gps: dict[str, Any] | None) -> Findings:

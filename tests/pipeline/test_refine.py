@@ -28,9 +28,10 @@ from gsba.bundle.pose_variables import X
 from gsba.camera.rig import CubeRig
 from gsba.config_file import load_config
 from gsba.evaluate.trajectory import evaluate
-from gsba.export import pictures
+from gsba.export import ExportFormat, export, pictures
 from gsba.frames import cubemap
 from gsba.log import GsbaError
+from gsba.store.finished import load_run
 from gsba.store.store import load_stage
 from gsba.trajectory.files import read_trajectory
 from gsba.types import FACES, Keypoints, PoseStatus, Trajectory
@@ -204,6 +205,18 @@ def test_formats_added_later_are_written_together(
     shutil.rmtree(out / "nerfstudio")
     assert computed_stages(case.refine(out, settings)) == [new]
     assert (out / "nerfstudio/transforms.json").is_file()
+
+
+def test_datasets_of_an_earlier_map_are_named(
+    case: Case, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    out, said = case.copy(tmp_path / "run"), "colmap holds a map of an earlier call"
+    export(*load_run(out), out / "mine", ExportFormat.TUM)
+    case.refine(out, exporting("nerfstudio"))  # of the same map
+    assert "of an earlier call" not in caplog.text
+    case.refine(out, exporting("nerfstudio").model_copy(update={"seed": 7919}))
+    assert said in caplog.text and "nerfstudio holds" not in caplog.text
+    assert f"(gsba export {out} --to tum --out {out / 'mine'})" in caplog.text
 
 
 def test_masks_reach_features_and_exports(case: Case, tmp_path: Path) -> None:
