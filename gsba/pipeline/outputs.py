@@ -91,7 +91,7 @@ def write(state: State, result: Reconstruction, cameras: Cameras) -> RunResult:
     (out / CALIBRATION).unlink(missing_ok=True)
     _write_calibrations(state, result, cameras)
     baseline = settings.camera.baseline()
-    placement = place(main, shown, settings.placement, baseline, settings.gps)
+    placement = place(main, shown, settings.placement, baseline, settings.gps, frames)
     _export(run, main, shown, placement, cameras.taken(rows))
     report = _report(state, result)
     write_json(out / "report.json", report)
