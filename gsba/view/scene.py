@@ -19,12 +19,14 @@ from gsba.placement.world import Placement, read_placement
 from gsba.report.html.figures import viewing_axes
 from gsba.splat.gaussians import SH_CONSTANT, Gaussians, read_ply
 from gsba.store.finished import load_cameras, load_run
+from gsba.store.folder import STAGES
 from gsba.trajectory.files import read_trajectory
 from gsba.types import FACES, FrameSet, Reconstruction, RunStart
 
 logger = logging.getLogger(__name__)
 
 _MAX_FACE_PX = 768  # of a shown cube face
+_SPLATS = "splat/*/point_cloud.ply"  # in a run's folder
 _MASK_SHARE = 0.6  # of that colour in masked pixels
 
 
@@ -71,7 +73,7 @@ def load_scene(run: Path) -> RunScene:
     axes, _ = viewing_axes(placed.world_T_rigs)
     splats = (
         _placed_splat(path.parent.name, read_ply(path), placement)
-        for path in sorted(run.glob("splat/*/point_cloud.ply"))
+        for path in sorted(run.glob(_SPLATS))
     )
     lenses = load_cameras(run, reconstruction, frames).scaled(placement.similarity.scale)
     steps = np.linalg.norm(np.diff(placed.world_T_rigs[:, :3, 3], axis=0), axis=1)
@@ -90,6 +92,12 @@ def load_scene(run: Path) -> RunScene:
         start=_start(run),
         judged=_judged(run, placed),
     )
+
+
+def files_of_scene(run: Path) -> list[Path]:
+    """The files of a run that its scene depends on."""
+    patterns = f"{STAGES}/reconstruction.npz", "*/transform.json", _SPLATS, "scan.json"
+    return sorted(path for pattern in patterns for path in run.glob(pattern))
 
 
 def _start(run: Path) -> str:
