@@ -20,7 +20,7 @@ from gsba.export.split import require_held_out
 from gsba.log import GsbaError, brief
 from gsba.placement.placement import Placement
 from gsba.similarity import Sim3
-from gsba.store.finished import cameras_of_map, one_map
+from gsba.store.finished import cameras_of_map, map_digest, one_map
 from gsba.store.shards import Workers, content_digest
 from gsba.store.store import fingerprint
 from gsba.types import FrameSet, PoseStatus, Reconstruction
@@ -87,6 +87,7 @@ def export_all(
     cameras = Cameras.of(options.lenses, frames)
     reconstruction, frames = one_map(whole, frames, map_number, "the reconstruction")
     cameras = cameras_of_map(cameras, whole, map_number)
+    digest = map_digest(reconstruction, frames)
     # Frames (F',) int64 of a map that an export holds.
     for name in options.without:
         if name not in frames.names:
@@ -111,7 +112,7 @@ def export_all(
     if len(reconstruction.points_world) == 0:
         logger.warning("the export holds poses but no points, and splat trainers need points")
     own = Placement(map_number=map_number).of_trajectory(reconstruction.origin)
-    placement = options.placement or own
+    placement = replace(options.placement or own, map_digest=digest)
     unplaced, reconstruction = reconstruction, placement.apply(reconstruction)
     seen_by, up = cameras.scaled(placement.similarity.scale), placement.up
     files = (path for paths in (*frames.paths, frames.mask_paths) for path in paths)

@@ -469,6 +469,12 @@ def _aligned(reconstruction: Reconstruction, frames: FrameSet, path: Path) -> Pl
         raise GsbaError(
             f"{path}: the frames have no times to match true poses with: refine with --timestamps"
         )
+    if any(frames.clock_shifts):
+        logger.warning(
+            "--align %s: its times are taken for those of the run's trajectory.tum, where several "
+            "recordings follow one another: poses on a recording's own clock end up elsewhere",
+            path,
+        )
     run = Trajectory(frames.timestamps, reconstruction.world_T_rigs)
     rows, of_truth = matched_in_time(run, truth, _TOLERANCE_S)
     good = reconstruction.pose_statuses[rows] == PoseStatus.REFINED

@@ -439,6 +439,22 @@ def test_positions_of_the_first_recording_place_no_map_of_another(
         place(result, second, settings, whole=both)
 
 
+def test_true_poses_of_several_recordings_are_on_one_clock(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A recording that begins half a second late is a frame off on its own clock, as is said."""
+    result, alone = walk_result(), frame_set(40)
+    late = dataclasses.replace(alone, timestamps=alone.timestamps + 0.5)
+    both = combine({name: _elsewhere(late, tmp_path / name) for name in ("one", "two")})
+    write_tum(tmp_path / "t.tum", Trajectory(late.timestamps, result.world_T_rigs))
+    settings = PlacementSettings(align=str(tmp_path / "t.tum"))
+    place(result, late, settings)
+    assert not caplog.records
+    placed = place(result, both.taken(both.recordings["one"]), settings)
+    assert placed.grounds["align"]["rmse"] > 1e-2
+    assert "times are taken for those of the run's trajectory.tum" in caplog.text
+
+
 def _elsewhere(frames: FrameSet, folder: Path) -> FrameSet:
     """The frames with files of their own."""
     folder.mkdir()
