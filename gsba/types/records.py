@@ -531,9 +531,12 @@ class Reconstruction:
     def of_map(self, number: int) -> "Reconstruction":
         """One map alone, 1 = the largest, in its own world and unit."""
         found = replace(self.taken(self.frames_of_map(number)), map_scales=None)
+        origins = found.observation_origins
+        if origins is not None and not origins.any():  # cameras of two lenses took other maps alone
+            found = replace(found, lens_baseline=None)
         if number == 1:
             return found
-        baseline, scale = self.lens_baseline, self.map_scale(number)
+        baseline, scale = found.lens_baseline, self.map_scale(number)
         if baseline is not None:
             found = replace(found, lens_baseline=(scale * baseline[0], scale * baseline[1]))
         # Vertical and origin are known in the world of the largest map.
