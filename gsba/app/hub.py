@@ -13,7 +13,8 @@ from gsba.app.progress import Progress, read_events
 from gsba.app.worker import ensure_worker
 from gsba.disk import write_text
 from gsba.log import GsbaError
-from gsba.view import load_scene
+from gsba.store.store import fingerprint
+from gsba.view import files_of_scene, load_scene
 from gsba.view import serve as serve_view
 
 if TYPE_CHECKING:
@@ -56,7 +57,7 @@ class App:
         self.token = token
         self.previews = Previews(self.root, state.resolve() / "previews")
         self._followed: dict[str, tuple[Progress, int]] = {}  # and bytes of events it holds
-        self._views: dict[Path, SceneView] = {}
+        self._views: dict[Path, tuple[object, SceneView]] = {}  # by run, with its files' state
         self._lock = threading.Lock()  # of viewers and of progress: requests come from threads
         ensure_worker(self.jobs)
 
@@ -71,15 +72,18 @@ class App:
             return progress
 
     def view(self, run: Path) -> str:
-        """Address of the viewer of a run, started if it is not shown yet. Raises GsbaError: viser
-        is missing, or the run is not finished."""
+        """Address of the viewer of a run, started if it is not shown yet as it is now. Raises
+        GsbaError: viser is missing, or the run is not finished."""
         with self._lock:
-            if run not in self._views:
-                self._views[run] = serve_view(load_scene(run), 0)
-            return self._views[run].address
+            state, known = fingerprint(files_of_scene(run)), self._views.get(run)
+            if known is None or known[0] != state:
+                self._views[run] = state, serve_view(load_scene(run), 0)
+                if known is not None:
+                    known[1].stop()
+            return self._views[run][1].address
 
     def close(self) -> None:
         """Stop the viewers and the previews; jobs go on."""
         self.previews.close()
-        for view in self._views.values():
+        for _, view in self._views.values():
             view.stop()

@@ -33,6 +33,7 @@ _MEMORY_SETTINGS = {  # first letters of a stage's name -> settings that lower i
     "export": "export.face_size",
 }
 _DEFAULT_MEMORY_SETTING = "features.max_per_face"  # of all other stages
+_ANEW = ("demo", "localize", "mask", "plot", "render")  # commands that resume nothing
 
 app = typer.Typer(
     help="Pixel-true camera poses for 360-degree video, from the video or frames alone, or from a "
@@ -45,14 +46,17 @@ app = typer.Typer(
 
 
 @contextmanager
-def _expected_failures() -> Iterator[None]:
-    """End failures with one line on stderr and an exit code, without a traceback."""
+def _expected_failures(command_name: str) -> Iterator[None]:
+    """End failures of a command with one line on stderr and an exit code, without a traceback."""
     try:
         yield
     except GsbaError as error:
         _fail(str(error))
     except KeyboardInterrupt:
-        _fail("interrupted; run again to resume", code=130)
+        next_ = (
+            "begins anew when it is run again" if command_name in _ANEW else "run again to resume"
+        )
+        _fail(f"interrupted; {next_}", code=130)
     except BrokenPipeError:  # `gsba ... | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise typer.Exit(1) from None
@@ -149,7 +153,7 @@ def command(function: Callable[P, None]) -> Callable[P, None]:
         code = 1
         _end_on_sigterm()
         try:
-            with _expected_failures():
+            with _expected_failures(name):
                 function(*args, **kwargs)
             code = 0
         except typer.Exit as ending:

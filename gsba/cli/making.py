@@ -2,10 +2,12 @@
 
 import logging
 from pathlib import Path
+from typing import Any
 
 import typer
 
 from gsba.cli.app import command, loading
+from gsba.cli.recordings import circle_of
 from gsba.cli.refining import conclude, run_folder, settings_of
 from gsba.cli.results import cameras_of, shutter_of
 from gsba.cli.splat import splat_settings, train_on
@@ -22,6 +24,8 @@ def splat(
     config: Path | None = None,
     overrides: list[str] | None = None,
     camera: str | None = None,
+    calibration: Path | None = None,
+    circle: list[str] | None = None,
     face_size: int | None = None,
     iterations: int | None = None,
     backend: str = "auto",
@@ -45,11 +49,13 @@ def splat(
         choose_backend(backend)
     camera_name = [f'camera.name="{camera}"'] if camera is not None else []
     settings = settings_of(config, [*camera_name, *(overrides or ())], None)
+    circles = [circle_of(text) for text in circle or ()]
+    lenses: dict[str, Any] = {"calibration": calibration, "circles": circles}
     with loading():
         from gsba import pipeline
     with held_until_computing():
         out = out or run_folder(frames)
-        result = pipeline.refine(frames, None, out, settings, fresh=fresh)
+        result = pipeline.refine(frames, None, out, settings, **lenses, fresh=fresh)
     if to is None:
         train_on(out, training)
         typer.echo(f"walk around in it: gsba view {out}")

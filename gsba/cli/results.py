@@ -62,6 +62,8 @@ def export(
     from gsba.store.cluster import connected, hired
     from gsba.store.finished import load_run, map_digest
     from gsba.store.folder import claim
+    from gsba.store.store import load_stage
+    from gsba.types import FrameSet
 
     if baseline is not None and scale != "lens":
         raise GsbaError("--baseline is for --scale lens: give that as well")
@@ -80,7 +82,9 @@ def export(
     folder = out or run / (name if map_number == 1 else f"{name}-map{map_number}")
     known = _baseline(run, baseline) if (scale, gps) != (None, None) else None
     noise = _gps_settings(run, gps_sigma, gps_offset) if gps is not None else None
-    placed = replace(place(reconstruction, frames, settings, known, noise), map_number=map_number)
+    whole = None if gps is None else load_stage(run, "frames", FrameSet)
+    placed = place(reconstruction, frames, settings, known, noise, whole)
+    placed = replace(placed, map_number=map_number)
     options = replace(
         options,
         placement=placed,
@@ -277,7 +281,9 @@ def _against_scan(run: Path, path: Path, known: dict[str, str]) -> dict[str, Any
     from gsba.report.html import add_scan
     from gsba.scans import in_file, read_scan
     from gsba.store.finished import load_run
+    from gsba.store.store import load_stage
     from gsba.trajectory.files import read_trajectory
+    from gsba.types import FrameSet
 
     reconstruction, frames = load_run(run)
     settings = validated({"placement": {"scan": str(path), **known}}).placement
@@ -290,7 +296,8 @@ def _against_scan(run: Path, path: Path, known: dict[str, str]) -> dict[str, Any
         )
     surfaces = read_scan(path)
     noise = _gps_settings(run, None, None)
-    guess, _ = guess_in_scan(reconstruction, frames, settings, surfaces, noise)
+    whole = load_stage(run, "frames", FrameSet)
+    guess, _ = guess_in_scan(reconstruction, frames, settings, surfaces, noise, whole)
     with in_file(path):
         errors = scan_errors(reconstruction, surfaces, coarse, guess)
     content = {"scan": str(path), "offset": surfaces.offset.tolist(), **errors.to_json()}

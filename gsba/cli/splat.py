@@ -98,6 +98,8 @@ def evaluate_splat(
             if path.stem not in ("refined", *others)
             else f"{path.parent.name}-{path.stem}"
         )
+        if name in ("refined", *others):
+            raise GsbaError(f"--against {path}: another file goes by {name}, too: rename one")
         others[name] = read_trajectory(path)
     results = _compare(run, others, settings, out, lpips)
     typer.echo(format_table(results))

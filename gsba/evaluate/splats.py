@@ -24,6 +24,7 @@ from gsba.splat.pictures import render_views
 from gsba.splat.scene import load_faces, make_views, split_frames, start_cloud
 from gsba.splat.scores import Distance, Score, mean_score, measure
 from gsba.splat.train import Images, Views, near_of, train
+from gsba.store.shards import content_digest
 from gsba.store.store import digest, fingerprint
 from gsba.trajectory.association import matched_in_time, refuse_untimed
 from gsba.types import FrameSet, PoseStatus, Reconstruction, Trajectory
@@ -95,6 +96,7 @@ def compare(
     size = settings.face_size
     training = load_faces(frames, split.training, size, optics)
     held_out = load_faces(frames, split.held_out, size, optics)
+    files = fingerprint(path for group in (*frames.paths, frames.mask_paths) for path in group)
     results, splats = {}, {}
     for name, poses in sources.items():
         logger.info("splat on %s poses, %d frames", name, len(split.training))
@@ -102,9 +104,9 @@ def compare(
             make_views(faces, poses[rows])
             for faces, rows in ((training, split.training), (held_out, split.held_out))
         ]
-        files = fingerprint([p[0] for p in frames.paths])
-        key = digest(files, poses.tolist(), settings, backend.name, *_key_of(optics))
         start = start_cloud(reconstruction, poses, split.training, settings.sh_degree)
+        known = content_digest(frames.formats, split.training, split.held_out, poses, start)
+        key = digest(files, known, settings, backend.name, *_key_of(optics))
         near = near_of(poses[split.training])
         splats[name], scores, curve = _train_and_measure(
             start, views, settings, near, backend, out / name, key, lpips

@@ -88,6 +88,7 @@ def export_all(
     reconstruction, frames = one_map(whole, frames, map_number, "the reconstruction")
     exported = map_digest(reconstruction, frames)
     cameras = cameras_of_map(cameras, whole, map_number)
+    digest = map_digest(reconstruction, frames)
     # Frames (F',) int64 of a map that an export holds.
     for name in options.without:
         if name not in frames.names:
@@ -112,7 +113,7 @@ def export_all(
     if len(reconstruction.points_world) == 0:
         logger.warning("the export holds poses but no points, and splat trainers need points")
     own = Placement(map_number=map_number).of_trajectory(reconstruction.origin)
-    placement = options.placement or own
+    placement = replace(options.placement or own, map_digest=digest)
     unplaced, reconstruction = reconstruction, placement.apply(reconstruction)
     seen_by, up = cameras.scaled(placement.similarity.scale), placement.up
     files = (path for paths in (*frames.paths, frames.mask_paths) for path in paths)

@@ -10,9 +10,9 @@ from gsba.store.folder import read_marker
 
 
 def of_run(folder: Path) -> tuple[Facts, str]:
-    """Facts about a run folder, and the command that shows it or goes on with it; "" = unknown."""
-    origin = read_marker(folder)["origin"]
-    facts = list(origin.items())
+    """Facts about a run folder, and the command that shows it; "" = it is not finished, and goes on
+    by the call that began it, whose options are not known."""
+    facts = tuple(read_marker(folder)["origin"].items())
     try:
         report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
         took = spoken_seconds(report["summary"]["seconds"])
@@ -22,10 +22,8 @@ def of_run(folder: Path) -> tuple[Facts, str]:
             ("verdict", report["verdict"]["sentence"]),
         ]
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        facts.append(("run", "not finished: the call that began it goes on where it stopped"))
-        inputs = [origin[name] for name in ("frames", "trajectory") if name in origin]
-        command = shlex.join(["gsba", "refine", *inputs, "--out", str(folder)])
-        return tuple(facts), command if inputs else ""
+        again = "the call that began it, with the same options, goes on where it stopped"
+        return (*facts, ("run", f"not finished: {again}")), ""
     datasets = sorted(path.parent.name for path in folder.glob("*/export.json"))
     if datasets:
         result.append(("datasets", ", ".join(datasets)))

@@ -28,7 +28,7 @@ from gsba.report.time_left import tell_size
 from gsba.store.store import RunStore, fingerprint
 from gsba.trajectory.association import follow_keyframes, without_trajectory
 from gsba.trajectory.conventions import Convention
-from gsba.trajectory.files import read_trajectory
+from gsba.trajectory.files import is_kitti, read_trajectory
 from gsba.trajectory.metashape import NamedPoses, is_metashape, read_metashape
 from gsba.trajectory.misread import refuse_useless
 from gsba.trajectory.restarts import associate_pieces, split_restarts, without_lost_frames
@@ -59,7 +59,8 @@ def read_trajectories(
     origin: Mapping[str, Path], timestamps: Path | None, convention: Convention
 ) -> list[Trajectory | NamedPoses]:
     """The trajectories of the files of a run, in pieces that each have a world of their own; poses
-    of Metashape's cameras, whose convention is known, get their times by `timed`."""
+    of Metashape's cameras, whose convention is known, get their times by `timed`. GsbaError for
+    timestamps beside a video that are not of KITTI's rows, too."""
     given = [path for name, path in origin.items() if name.startswith("trajectory")]
     if any(map(is_metashape, given)):
         if convention != Convention():
@@ -74,6 +75,11 @@ def read_trajectories(
                 "were aligned, not a video"
             )
         return [component for path in given for component in read_metashape(path)]
+
+    untimed = [path for name, path in origin.items() if name != "frames" and is_kitti(path)]
+    if timestamps is not None and not untimed and video.is_video(origin["frames"]):
+        held = "holds the times of its frames" + (", and its trajectory its own" if given else "")
+        raise GsbaError(f"a video {held}: leave out --timestamps")
 
     def read(path: Path) -> Trajectory:
         return convention.poses(read_trajectory(path, timestamps))

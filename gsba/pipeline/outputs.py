@@ -96,7 +96,7 @@ def write(state: State, result: Reconstruction, cameras: Cameras) -> RunResult:
     (out / CALIBRATION).unlink(missing_ok=True)
     _write_calibrations(state, result, cameras)
     baseline = settings.camera.baseline()
-    placement = place(main, shown, settings.placement, baseline, settings.gps)
+    placement = place(main, shown, settings.placement, baseline, settings.gps, frames)
     _export(run, main, shown, placement, cameras.taken(rows))
     _warn_of_datasets_before(out, result, frames)
     report = _report(state, result)

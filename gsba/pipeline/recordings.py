@@ -84,8 +84,6 @@ class GivenRecording:
         poses = inputs.trajectory_files(recording.trajectory, _path(recording.keyframes))
         origin = {"frames": folder} | poses
         with naming_recording(name):
-            if recording.timestamps is not None and not poses and video.is_video(folder):
-                raise GsbaError("a video holds the times of its frames: leave out --timestamps")
             pieces = inputs.read_trajectories(origin, _path(recording.timestamps), convention)
         files = {f"{prefix}{what}": path for what, path in origin.items()}
         return cls(name, recording, files, tuple(pieces), folder)

@@ -70,7 +70,10 @@ def read_fixes(
 
 
 def fixes_of_frames(
-    source: str, frames: FrameSet, settings: GpsSettings | None = None
+    source: str,
+    frames: FrameSet,
+    settings: GpsSettings | None = None,
+    whole: FrameSet | None = None,
 ) -> FrameFixes:
     """Fixes of frames by name, or interpolated between the fixes before and after. Names without a
     recording are of the first one: fixes of a run stay when recordings are added.
@@ -85,11 +88,14 @@ def fixes_of_frames(
     Args:
         frames: frames of the run; they need times unless fixes name frames.
         settings: smallest noise of the fixes.
+        whole: all frames of the run, of which `frames` are a map: its recordings are those that
+            the source is of; None = `frames` are all.
 
     Raises:
         GsbaError: the source cannot be read, its receiver had no lock, or its times do not overlap
             with the frames'.
     """
+    some, frames = frames, whole or frames
     fixes = read_fixes(source, frames, settings)
     assert fixes is not None  # frames are known
     fixes = _locked(source, fixes)
@@ -106,6 +112,11 @@ def fixes_of_frames(
         rows = np.array([f for f, name in enumerate(frames.names) if name in by_name], np.int64)
         chosen = [by_name[frames.names[f]] for f in rows]
         geodetic, sigmas = fixes.geodetic[chosen], fixes.sigmas[chosen]
+    if whole is not None:
+        numbers = {name: f for f, name in enumerate(some.names)}
+        among = np.array([numbers.get(frames.names[f], -1) for f in rows], np.int64)
+        rows, geodetic, sigmas = (each[among >= 0] for each in (among, geodetic, sigmas))
+        frames = some
     origin = np.median(geodetic, axis=0) if len(rows) else np.zeros(3)
     local = local_from_geodetic(geodetic, origin)
     times = frames.timestamps[rows] if frames.timed_frames[rows].all() else None
@@ -184,8 +195,8 @@ def _between(
         raise GsbaError(
             f"{source}: no overlap in time: positions span {entries[0]:.3f} to {entries[-1]:.3f} "
             f"s, frames {times[0]:.3f} to {times[-1]:.3f} s; give both on one clock, "
-            "or the seconds to add to the positions' times (--gps-offset SECONDS; of refine, --set "
-            "gps.offset_s=SECONDS)"
+            "or the seconds to add to the positions' times (--gps-offset SECONDS of export; of "
+            "refine, --set gps.offset_s=SECONDS)"
         )
     after = np.clip(np.searchsorted(entries, times[inside]), 1, max(len(entries) - 1, 1))
     after = np.minimum(after, len(entries) - 1)

@@ -41,6 +41,8 @@ _MAX_LENS_SCALE_SIGMA = 0.1  # relative, of a scale by the lenses
 _MAX_GPS_ANGLE_SIGMA_DEG = 25.0  # of heading and tilt by GPS
 _MAX_SCALE_SIGMAS = 4.0  # of two scales that agree: true ones differ by more once in 16,000 runs
 _MEASURED_SIGMA = 0.02  # relative, of a scale by a tape measure
+_GUESS_SIGMAS = 3.0  # width of a guess in a scan, by GPS
+_MAX_GUESS_ANGLE_DEG = 90.0  # wider guesses of an axis rule next to nothing out
 _NUM_NAMED = 5  # false positions that a message names
 _UPSIDE_DOWN = -0.5  # vertical component of the cameras' up axes: 120 degrees from up
 _MAX_LEAN_DEG = 30.0  # from up, of the cameras' mean up axis: people hold them upright
@@ -53,6 +55,7 @@ def place(
     settings: PlacementSettings,
     baseline: tuple[float, float] | None = None,
     gps: GpsSettings | None = None,
+    whole: FrameSet | None = None,
 ) -> Placement:
     """Placement of a run's world by the settings.
 
@@ -66,12 +69,13 @@ def place(
             `pairs` only start the alignment.
         baseline: distance of the lenses and its standard deviation, metres, for a length of "lens";
             other scales that contradict it are warned of.
+        gps, whole: as of `fixes_of_frames`.
 
     Raises:
         GsbaError: settings exclude one another, or data do not determine the placement.
     """
     check(settings, baseline=baseline)
-    placement = _placement(reconstruction, frames, settings, baseline, gps)
+    placement = _placement(reconstruction, frames, settings, baseline, gps, whole)
     if placement.unit == "m" and settings.length != "lens":
         _warn_of_lenses(placement, reconstruction, baseline)
     placed = placement.similarity.points(reconstruction.world_T_rigs[:, :3, 3])
@@ -93,6 +97,7 @@ def _placement(
     settings: PlacementSettings,
     baseline: tuple[float, float] | None,
     gps: GpsSettings | None,
+    whole: FrameSet | None,
 ) -> Placement:
     """Placement by the settings, without a check of its range."""
     if settings.align is not None:
@@ -100,7 +105,7 @@ def _placement(
     if settings.scan is not None:
         path = Path(settings.scan)
         scan = read_scan(path)
-        guess, grounds = guess_in_scan(reconstruction, frames, settings, scan, gps)
+        guess, grounds = guess_in_scan(reconstruction, frames, settings, scan, gps, whole)
         with in_file(path):
             found = register(cloud_of(reconstruction, normals_of), scan, guess)
         logger.info("--align-scan %s: %s", path, found)
@@ -117,7 +122,8 @@ def _placement(
             scale, grounds = _scale_by_lenses(reconstruction, baseline)
             grounds = {**placement.grounds, "lens": grounds}
             placement = dataclasses.replace(placement, grounds=grounds)
-        return _on_earth(reconstruction, frames, settings.gps, placement, scale, gps)
+        fixes = fixes_of_frames(settings.gps, frames, gps, whole)
+        return _on_earth(reconstruction, frames, Path(settings.gps), fixes, placement, scale)
     if settings.length == "lens":
         (scale, sigma), grounds = _scale_by_lenses(reconstruction, baseline)
         if not sigma < _MAX_LENS_SCALE_SIGMA * scale:
@@ -185,8 +191,7 @@ def _upright(reconstruction: Reconstruction, frames: FrameSet) -> Placement:
     gravity = estimate_gravity(reconstruction, frames)
     if gravity is None:
         raise GsbaError(
-            "--up auto: the frames have no common up axis; leave it out, or place the world by "
-            "--gps or --align"
+            "--up auto: the frames have no common up axis; leave it out, or give --gps FILE"
         )
     grounds = {
         "vertical_edges": gravity.num_edges,
@@ -280,13 +285,14 @@ def _point(text: str, reconstruction: Reconstruction, frames: FrameSet) -> np.nd
 def _on_earth(
     reconstruction: Reconstruction,
     frames: FrameSet,
-    source: str,
+    path: Path,
+    fixes: FrameFixes,
     upright: Placement,
     scale: tuple[float, float] | None = None,
-    settings: GpsSettings | None = None,
+    determined: bool = True,
 ) -> Placement:
-    """Placement in metres east, north and up around the median fix; keeps `upright`'s up."""
-    fixes, path = fixes_of_frames(source, frames, settings), Path(source)
+    """Placement in metres east, north and up around the median fix; keeps `upright`'s up. GsbaError
+    if fixes contradict the run or, where it is to be `determined`, leave scale or axes open."""
     fixes = fixes.taken(reconstruction.pose_statuses[fixes.frames] == PoseStatus.REFINED)
     if len(fixes) < 3:
         raise GsbaError(
@@ -320,9 +326,15 @@ def _on_earth(
         found = fit_fixes(positions @ level.T, fixes, up_sigma, scale)
     off = residuals_of(found.similarity, positions @ level.T, fixes.positions)
     _require_majority(
-        path, found.used, off, frames, fixes.frames, "a noisier receiver needs --gps-sigma"
+        path,
+        found.used,
+        off,
+        frames,
+        fixes.frames,
+        "a noisier receiver needs --gps-sigma (of export)",
     )
-    _require_determined(path, found, fixes)
+    if determined:
+        _require_determined(path, found, fixes)
     if scale is not None:
         alone = fit_fixes(positions @ level.T, fixes, up_sigma)
         ratio = abs(np.log(alone.similarity.scale / scale[0]))
@@ -457,6 +469,12 @@ def _aligned(reconstruction: Reconstruction, frames: FrameSet, path: Path) -> Pl
         raise GsbaError(
             f"{path}: the frames have no times to match true poses with: refine with --timestamps"
         )
+    if any(frames.clock_shifts):
+        logger.warning(
+            "--align %s: its times are taken for those of the run's trajectory.tum, where several "
+            "recordings follow one another: poses on a recording's own clock end up elsewhere",
+            path,
+        )
     run = Trajectory(frames.timestamps, reconstruction.world_T_rigs)
     rows, of_truth = matched_in_time(run, truth, _TOLERANCE_S)
     good = reconstruction.pose_statuses[rows] == PoseStatus.REFINED
@@ -496,10 +514,11 @@ def guess_in_scan(
     settings: PlacementSettings,
     scan: Scan,
     gps: GpsSettings | None = None,
+    whole: FrameSet | None = None,
 ) -> tuple[Guess, dict[str, Any]]:
     """Initial guess of a run's placement in a scan, in its world less its offset, by `pairs`, else
     `gps`, else `up`, and entries of transform.json on it. GsbaError if files cannot be used, or
-    frames have no common up axis. `gps`: as of `place`."""
+    frames have no common up axis. `gps`, `whole`: as of `place`."""
     axis = np.eye(3)["xyz".index(upwards(Path(settings.scan or "")))]
     if settings.pairs is not None:
         path = Path(settings.pairs)
@@ -512,11 +531,29 @@ def guess_in_scan(
         return guess.without(scan.offset), {"pairs": settings.pairs}
     if settings.gps is not None:
         upright = _upright(reconstruction, frames) if settings.up == "auto" else Placement()
-        earth = _on_earth(reconstruction, frames, settings.gps, upright, settings=gps)
-        turn = _least_turn(np.array([0.0, 0, 1]), axis)
-        rotation = turn @ earth.similarity.rotation
-        return Guess(scale=earth.similarity.scale, rotation=rotation), earth.grounds
+        fixes, path = fixes_of_frames(settings.gps, frames, gps, whole), Path(settings.gps)
+        earth = _on_earth(reconstruction, frames, path, fixes, upright, determined=False)
+        return _guess_of(earth, axis), earth.grounds
     if settings.up == "auto":
         upright = _upright(reconstruction, frames)
         return Guess(axis=(upright.similarity.rotation.T @ _UP_WORLD, axis)), upright.grounds
     return Guess(), {}
+
+
+def _guess_of(earth: Placement, axis: np.ndarray) -> Guess:
+    """Guess in a scan whose `axis` points up, as wide as a placement by GPS is uncertain."""
+    found = earth.grounds["gps"]
+    spread = _GUESS_SIGMAS * found["scale_sigma"] / earth.similarity.scale
+    tilt, heading = (_GUESS_SIGMAS * found[f"{name}_sigma_deg"] for name in ("tilt", "heading"))
+    scale = earth.similarity.scale if spread < 1 else None
+    usual = Guess()
+    ratio = max(usual.scale_ratio, float(np.exp(min(spread, 1))))
+    known: dict[str, Any] = {"scale": scale, "scale_ratio": ratio}
+    rotation = _least_turn(np.array([0.0, 0, 1]), axis) @ earth.similarity.rotation
+    turn = max(usual.angle_deg, float(np.hypot(tilt, heading)))
+    if turn < _MAX_GUESS_ANGLE_DEG:
+        return Guess(rotation=rotation, angle_deg=turn, **known)
+    if tilt < _MAX_GUESS_ANGLE_DEG:
+        ends = rotation.T @ axis, axis
+        return Guess(axis=ends, angle_deg=max(usual.angle_deg, tilt), **known)
+    return Guess(**known)

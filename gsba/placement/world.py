@@ -26,6 +26,7 @@ class Placement:
     origin: tuple[float, float, float] | None = None  # latitude, longitude, altitude of placed 0
     grounds: dict[str, Any] = field(default_factory=dict)  # data it was computed from, and sigmas
     map_number: int = 1  # map of the run that is placed, 1 = the largest
+    map_digest: str = ""  # of that map, see `gsba.store.finished.map_digest`; "" = not known
 
     @property
     def matrix(self) -> np.ndarray:
@@ -88,6 +89,7 @@ class Placement:
             "origin": None if self.origin is None else dict(zip(names, self.origin, strict=True)),
             "grounds": self.grounds,
             "map": self.map_number,
+            "map_digest": self.map_digest,
         }
 
     def write(self, path: Path) -> None:
@@ -113,6 +115,7 @@ def read_placement(path: Path) -> Placement:
             origin,
             content["grounds"],
             int(content.get("map", 1)),
+            str(content.get("map_digest", "")),
         )
     except OSError as error:
         raise GsbaError(f"{path}: cannot be read ({error.strerror})") from None

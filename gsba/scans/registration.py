@@ -3,7 +3,7 @@
 import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -105,7 +105,7 @@ def register(cloud: Cloud, scan: Scan, guess: Guess | None = None) -> Registrati
         twin, axis = cloud.mirrored(), guess.axis
         if axis is not None:
             axis = axis[0] * [-1, 1, 1], axis[1]
-        for fit in _likeliest(twin, scan, Guess(scale=guess.scale, axis=axis), grid, 1):
+        for fit in _likeliest(twin, scan, replace(guess, axis=axis, rotation=None), grid, 1):
             evidence = verdict(fit.similarity, twin, scan, grid, found.fit.noise)
             doubt = evidence.doubt(found.verdict)
             logger.debug("mirrored: %.3f explained, p = %.2g of its lead", evidence.share, doubt)

@@ -22,10 +22,12 @@ class Guess:
     """Prior knowledge of a similarity; None = unknown."""
 
     similarity: Sim3 | None = None  # initial similarity, near the result
-    scale: float | None = None  # scale, known to a tenth
+    scale: float | None = None
     axis: tuple[np.ndarray, np.ndarray] | None = None  # unit vectors (3,) of cloud and scan: the
-    # similarity maps one to the other, to some degrees
-    rotation: np.ndarray | None = None  # (3, 3), known to some degrees
+    # similarity maps one to the other
+    rotation: np.ndarray | None = None  # (3, 3)
+    scale_ratio: float = 1.1  # largest ratio of the true scale to `scale`, and its inverse
+    angle_deg: float = 15.0  # largest angle to the true axis, or of the true rotation to `rotation`
 
     def without(self, offset: np.ndarray) -> "Guess":
         """Guess for a scan whose offset (3,) is split off."""
@@ -36,9 +38,11 @@ class Guess:
 
     def allows(self, candidate: Sim3) -> bool:
         """True if a similarity agrees with the known scale, axis and rotation."""
-        least = np.cos(np.radians(15.0))
-        if self.scale is not None and not 1 / 1.1 < candidate.scale / self.scale < 1.1:
-            return False
+        least = np.cos(np.radians(self.angle_deg))
+        if self.scale is not None:
+            ratio = candidate.scale / self.scale
+            if not 1 / self.scale_ratio < ratio < self.scale_ratio:
+                return False
         if self.axis is not None and self.axis[1] @ candidate.rotation @ self.axis[0] < least:
             return False
         if self.rotation is None:
@@ -140,7 +144,7 @@ def _by_axes(cloud: Cloud, scan: Scan, guess: Guess) -> Iterator[Sim3]:
     if guess.scale is None:
         low_scale, high_scale = np.array(_SCALE_RANGE) * size_of(scan.points) / cloud.size
     else:
-        low_scale, high_scale = guess.scale / 1.1, guess.scale * 1.1
+        low_scale, high_scale = guess.scale / guess.scale_ratio, guess.scale * guess.scale_ratio
     scales = np.exp(np.arange(np.log(low_scale), np.log(high_scale), np.log(1.012)))
     profiles = [_profile(there[:, j] - low[j], scan.normals @ of_scan[j], width) for j in range(3)]
     spectra = np.fft.rfft(profiles, 2 * _BINS)
@@ -166,9 +170,8 @@ def _by_axes(cloud: Cloud, scan: Scan, guess: Guess) -> Iterator[Sim3]:
         at = [shifts[axes[j], flips[j], j, numbers, peaks[j]] for j in range(3)]
         for n, shift in zip(numbers.tolist(), np.stack(at, axis=1), strict=True):
             fit = Sim3(float(scales[n]), rotation, of_scan.T @ shift - centres[n])
-            if not guess.allows(fit):
-                break
-            yield fit
+            if guess.allows(fit):
+                yield fit
 
 
 def _peaks(correlated: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -4,6 +4,7 @@ import logging
 import math
 import os
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 MAX_COORDINATE = 1e12  # largest coordinate, in any unit: beyond, differences lose precision
+_KITTI_COLUMNS = 12  # of a row: 3 x 4, row-major
 _UNIT_TOLERANCE = 1e-3  # largest deviation of a quaternion's norm from one
 
 
@@ -58,7 +60,7 @@ def read_trajectory(path: Path, timestamps: Path | None = None) -> Trajectory:
     columns = len(rows[0][1].split())
     if columns == 8:
         return _read_tum(path, rows)
-    if columns == 12:
+    if columns == _KITTI_COLUMNS:
         return _read_kitti(path, rows, timestamps)
     found = f"{columns} values"
     if columns == 1 and "," in rows[0][1]:
@@ -71,6 +73,14 @@ def read_trajectory(path: Path, timestamps: Path | None = None) -> Trajectory:
         f"{path}:{rows[0][0]}: {found}; want 8 separated by blanks (TUM: timestamp tx ty "
         "tz qx qy qz qw) or 12 (KITTI)"
     )
+
+
+def is_kitti(path: Path) -> bool:
+    """True if a file holds rows of KITTI, whose poses have no times."""
+    with suppress(GsbaError):  # a map, or no file
+        rows = read_lines(path)
+        return bool(rows) and len(rows[0][1].split()) == _KITTI_COLUMNS
+    return False
 
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:
@@ -148,7 +158,7 @@ def _read_kitti(path: Path, rows: Sequence[tuple[int, str]], timestamps: Path | 
             f"{path}: {len(rows)} poses but {len(times)} times in {timestamps}; frames lost by the "
             "SLAM have no row in a KITTI file, so give the TUM file or a matching list"
         )
-    where, cells = _split(path, rows, 12)
+    where, cells = _split(path, rows, _KITTI_COLUMNS)
     values = np.array([[_value(v, w) for v in c] for c, w in zip(cells, where, strict=True)])
     world_P_rigs = values.reshape(-1, 3, 4)
     turned = (world_P_rigs[:, :, :3] != 0).any(axis=(1, 2))

@@ -530,14 +530,15 @@ class Reconstruction:
 
     def of_map(self, number: int) -> "Reconstruction":
         """One map alone, 1 = the largest, in its own world and unit."""
-        found = replace(self.taken(self.frames_of_map(number)), map_scales=None)
-        if number == 1:
-            return found
-        baseline, scale = self.lens_baseline, self.map_scale(number)
-        if baseline is not None:
-            found = replace(found, lens_baseline=(scale * baseline[0], scale * baseline[1]))
+        found = self.taken(self.frames_of_map(number))
+        baseline, origins = self.lens_baseline, found.observation_origins
+        if origins is not None and not origins.any():  # cameras of two lenses took other maps alone
+            baseline = None
+        scale = self.map_scale(number)
+        baseline = baseline and (scale * baseline[0], scale * baseline[1])
+        found = replace(found, lens_baseline=baseline, map_scales=None)
         # Vertical and origin are known in the world of the largest map.
-        return replace(found, vertical=None, origin=None)
+        return found if number == 1 else replace(found, vertical=None, origin=None)
 
     def map_scale(self, number: int) -> float:
         """Units of a map's world per unit of the largest map's."""

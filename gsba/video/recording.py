@@ -11,6 +11,7 @@ their size: streams 0 and 5 of videos, 0 and 4 of time lapses.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import tee
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,7 @@ from gsba.frames.side_by_side import (
     two_circles,
 )
 from gsba.log import GsbaError
+from gsba.store.store import fingerprint
 from gsba.trajectory.association import nearest
 from gsba.types.records import spread_rows
 from gsba.video.colours import bgr, luma
@@ -126,7 +128,16 @@ def read_recording(video: Path) -> VideoRecording:
     """Recognise the layout of a video and read its times. GsbaError: the file is no video, holds
     neither panoramas nor a cube map nor two lenses, or its lenses or tracks do not match."""
     files = files_of(video)
-    sizes = track_sizes(files[0])
+    return _recognised(video, files, tuple(track_sizes(files[0])), fingerprint(files))
+
+
+@lru_cache(
+    maxsize=8
+)  # to check, to follow and to extract a video, all of its packets are read once
+def _recognised(
+    video: Path, files: tuple[Path, ...], sizes: tuple[tuple[int, int], ...], _state: object
+) -> VideoRecording:
+    """Layout and times of the files of a video, in their state."""
     size = sizes[0]
     if (cube := cube_tracks(files[0], sizes)) is not None:
         width, height = sizes[cube[0]]

@@ -18,13 +18,15 @@ from gsba.log import GsbaError
 from gsba.placement.world import Placement, read_placement
 from gsba.report.html.figures import viewing_axes
 from gsba.splat.gaussians import SH_CONSTANT, Gaussians, read_ply
-from gsba.store.finished import load_cameras, load_run
+from gsba.store.finished import load_cameras, load_run, map_digest
+from gsba.store.folder import STAGES
 from gsba.trajectory.files import read_trajectory
 from gsba.types import FACES, FrameSet, Reconstruction, RunStart
 
 logger = logging.getLogger(__name__)
 
 _MAX_FACE_PX = 768  # of a shown cube face
+_SPLATS = "splat/*/point_cloud.ply"  # in a run's folder
 _MASK_SHARE = 0.6  # of that colour in masked pixels
 
 
@@ -61,17 +63,17 @@ class RunScene:
 def load_scene(run: Path) -> RunScene:
     """Scene of a finished run's largest map.
 
-    Its world is that of the run's last export with a placement (upright, in metres, by GPS or
-    truth), or else the run's own. Splats in RUN/splat are transformed to it. Raises GsbaError: the
-    folder is no finished run, or a splat or transform.json cannot be read.
+    Its world is that of the last export of this very map with a placement (upright, in metres, by
+    GPS or truth), or else the run's own. Splats in RUN/splat are transformed to it. Raises
+    GsbaError: the folder is no finished run, or a splat or transform.json cannot be read.
     """
     reconstruction, frames = load_run(run)
-    placement, grounds = _latest_placement(run)
+    placement, grounds = _latest_placement(run, map_digest(reconstruction, frames))
     placed = placement.apply(reconstruction)
     axes, _ = viewing_axes(placed.world_T_rigs)
     splats = (
         _placed_splat(path.parent.name, read_ply(path), placement)
-        for path in sorted(run.glob("splat/*/point_cloud.ply"))
+        for path in sorted(run.glob(_SPLATS))
     )
     lenses = load_cameras(run, reconstruction, frames).scaled(placement.similarity.scale)
     steps = np.linalg.norm(np.diff(placed.world_T_rigs[:, :3, 3], axis=0), axis=1)
@@ -90,6 +92,12 @@ def load_scene(run: Path) -> RunScene:
         start=_start(run),
         judged=_judged(run, placed),
     )
+
+
+def files_of_scene(run: Path) -> list[Path]:
+    """The files of a run that its scene depends on."""
+    patterns = f"{STAGES}/reconstruction.npz", "*/transform.json", _SPLATS, "scan.json"
+    return sorted(path for pattern in patterns for path in run.glob(pattern))
 
 
 def _start(run: Path) -> str:
@@ -167,12 +175,16 @@ def _tinted(image: np.ndarray, use: np.ndarray) -> np.ndarray:
     return np.where(use[..., None], image, tinted)
 
 
-def _latest_placement(run: Path) -> tuple[Placement, str]:
-    """Placement of the latest export of map 1 that has one, else the identity; and its source."""
+def _latest_placement(run: Path, digest: str) -> tuple[Placement, str]:
+    """Placement of the latest export of map 1, as it is now, that has one, else the identity; and
+    its source."""
     files = sorted(run.glob("*/transform.json"), key=lambda path: path.stat().st_mtime_ns)
     for path in reversed(files):
         placement = read_placement(path)
         if placement.map_number != 1:
+            continue
+        if placement.map_digest not in ("", digest):
+            logger.warning("%s places an earlier map of the run: export again", path)
             continue
         if placement.up is not None or not np.array_equal(placement.matrix, np.eye(4)):
             return placement, f"placed as in {path.parent.name}"

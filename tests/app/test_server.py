@@ -275,3 +275,27 @@ def test_a_run_of_the_page_is_that_of_the_command_line(case: Case, tmp_path: Pat
     added = post(client, "api/add", {"command": "export", "values": exported})
     assert wait_for(client, added["id"])["status"] == "done" and (root / out / "tum").is_dir()
     app.close()
+
+
+def test_a_run_that_was_refined_anew_is_shown_anew(
+    app: App, root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Shown:
+        stopped = False
+
+        def __init__(self, *_: object) -> None:
+            self.address = f"view {len(made)}"
+            made.append(self)
+
+        def stop(self) -> None:
+            self.stopped = True
+
+    made = list[Shown]()
+    monkeypatch.setattr("gsba.app.hub.load_scene", lambda run: None)
+    monkeypatch.setattr("gsba.app.hub.serve_view", Shown)
+    run = root / "walk"
+    (run / "stages").mkdir()
+    (run / "stages/reconstruction.npz").write_bytes(b"1")
+    assert app.view(run) == app.view(run) == "view 0"
+    (run / "stages/reconstruction.npz").write_bytes(b"22")
+    assert app.view(run) == "view 1" and made[0].stopped and not made[1].stopped

@@ -216,6 +216,20 @@ def test_each_map_has_its_own_unit(world: World) -> None:
     np.testing.assert_allclose(of_other.readout_motion[:, 3:], 3 * lenses.readout_motion[6:, 3:])
 
 
+def test_a_map_of_other_cameras_alone_has_no_unit_by_the_lenses(world: World) -> None:
+    """Nothing ties its unit to that of the map with two lenses, so that these give no scale."""
+    groups = np.repeat([0, 1], [6, 4]).astype(np.int32)
+    coarse = CoarsePoses(_in_slam(world.world_T_rigs), np.zeros(10, np.uint8), 0.0)
+    given = _adjustment(world), np.zeros((10, 6, 6)), world.keypoints, coarse, 12
+    whole = assemble(*given, components=groups)
+    for two_lenses in (0, 1):
+        origins = np.zeros((len(whole.observation_frames), 3))
+        origins[groups[whole.observation_frames] == two_lenses, 2] = 0.1
+        both = replace(whole, lens_baseline=(0.25, 0.01), observation_origins=origins)
+        assert both.of_map(2 - two_lenses).lens_baseline is None
+        assert both.of_map(1 + two_lenses).lens_baseline is not None
+
+
 def test_a_frame_alone_is_no_map(world: World) -> None:
     coarse = CoarsePoses(_in_slam(world.world_T_rigs), np.zeros(10, np.uint8), 0.0)
     groups = np.array([0, 0, 0, 0, 0, 1, 1, 1, 3, 2], np.int32)

@@ -141,6 +141,14 @@ def test_expected_failures_are_one_line(
     fails(run_gsba("export", "run", "--to", "colmap"), message, code)
 
 
+def test_what_begins_anew_is_not_said_to_resume(monkeypatch: pytest.MonkeyPatch) -> None:
+    def stopped(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("gsba.demo.make_walk", stopped)
+    fails(run_gsba("demo"), "error: interrupted; begins anew when it is run again", 130)
+
+
 def test_what_nobody_foresaw_is_one_line_that_can_be_reported(
     pipeline: Callable[[BaseException], None],
 ) -> None:

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 from command import fails, run_gsba, succeed
@@ -21,9 +22,9 @@ def test_splat_writes_a_trainers_dataset(
     run, called = case.copy(tmp_path / "run"), []
 
     def refine(
-        frames: Path, trajectory: None, out: Path, settings: RefineSettings, fresh: bool
+        frames: Path, trajectory: None, out: Path, settings: RefineSettings, **rest: Any
     ) -> RunResult:
-        called.append((frames, trajectory, out, settings, fresh))
+        called.append((frames, trajectory, out, settings, rest))
         return case.result
 
     def no_vertical(*given: object) -> None:
@@ -33,9 +34,13 @@ def test_splat_writes_a_trainers_dataset(
     if not upright:
         monkeypatch.setattr("gsba.placement.placement.place", no_vertical)
     options = ("--out", run, "--to", "brush", "--config", "fast", "--face-size", 64)
-    options += () if upright else ("--fresh",)
+    lenses = "--calibration", tmp_path / "lenses.json", "--circle", "9,8,7"
+    options += lenses if upright else ("--fresh",)
+    known = {"calibration": tmp_path / "lenses.json", "circles": [(9.0, 8.0, 7.0)]}
+    known = known if upright else {"calibration": None, "circles": []}
+    known |= {"fresh": not upright}
     done = succeed("splat", tmp_path / "walk.mp4", *options)
-    assert called == [(tmp_path / "walk.mp4", None, run, load_config(Path("fast")), not upright)]
+    assert called == [(tmp_path / "walk.mp4", None, run, load_config(Path("fast")), known)]
     assert f"brush: brush {run / 'brush'}" in done.output
     assert (run / "brush/sparse/0/images.bin").is_file()
     place = json.loads((run / "brush/transform.json").read_text())

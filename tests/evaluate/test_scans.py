@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from plain_records import frames_of, map_of
 from scan_world import HALL, INTO_SCAN, SIZE, cloud, scan
+from scipy.spatial.transform import Rotation
 from synthetic import unit
 from walk_on_earth import frame_set, geodetic_of, level_metres, walk_result, write_fixes
 
@@ -20,6 +21,7 @@ from gsba.geometry import pose
 from gsba.placement import guess_in_scan
 from gsba.scans.search import Guess
 from gsba.scans.types import Scan
+from gsba.similarity import Sim3
 from gsba.trajectory.files import write_tum
 from gsba.types import PictureFormat, Reconstruction, Trajectory
 
@@ -95,6 +97,28 @@ def test_positions_that_start_the_fit_have_their_own_clock_and_noise(tmp_path: P
     receiver = GpsSettings(offset_s=-1000.0, sigma_m=0.5, sigma_up_m=0.5)
     guess, _ = guess_in_scan(run, frames, known, nothing, receiver)
     assert guess.scale == pytest.approx(1 / 0.21, rel=1e-3)
+
+
+@pytest.mark.parametrize("sigma", [0.1, 6.0])
+def test_a_start_by_positions_is_as_wide_as_they_are_uncertain(
+    tmp_path: Path, sigma: float
+) -> None:
+    """Noise of metres on a walk of 30 rules the true place out neither by scale nor by heading."""
+    run, frames = walk_result(), frame_set(40)
+    true = Sim3(1 / 0.21, Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix().T)
+    known = PlacementSettings(scan="scan.ply", gps=str(tmp_path / "gps.csv"))
+    nothing = Scan(np.zeros((1, 3)), np.ones((1, 3)), np.zeros(3))
+    receiver = GpsSettings(sigma_m=sigma, sigma_up_m=sigma)
+    apart = np.abs(frames.timestamps[:, None] - frames.timestamps) / 60.0  # errors last a minute
+    mixed = sigma * np.linalg.cholesky(0.1 * np.eye(40) + 0.9 * np.exp(-apart))
+    for seed in range(8):
+        off = mixed @ np.random.default_rng(seed).normal(size=(40, 3))
+        write_fixes(tmp_path / "gps.csv", frames.timestamps, geodetic_of(level_metres(run) + off))
+        guess, _ = guess_in_scan(run, frames, known, nothing, receiver)
+        assert guess.allows(true)
+        if sigma < 1:
+            assert guess.scale is not None and guess.rotation is not None
+            assert (guess.scale_ratio, guess.angle_deg) == (Guess().scale_ratio, Guess().angle_deg)
 
 
 def test_a_scan_and_a_truth_are_both_in_the_json(

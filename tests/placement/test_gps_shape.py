@@ -13,6 +13,7 @@ from walk_on_earth import frame_set, geodetic_of, walk_result, write_fixes
 from gsba.config import PlacementSettings
 from gsba.geometry import pose
 from gsba.log import GsbaError
+from gsba.placement import fixes_of_frames
 from gsba.placement import placement as placing
 from gsba.placement.gps import local_from_geodetic
 from gsba.placement.gps_shape import are_mirrored, lag_of
@@ -96,8 +97,9 @@ def test_a_mirrored_file_is_refused_where_up_is_known(tmp_path: Path) -> None:
     geodetic = geodetic_of((path + lasting_errors(times[:120], rng)) * [-1.0, 1, 1])
     file = write_fixes(tmp_path / "gps.csv", times[:120], geodetic)
     upright = Placement(Sim3(rotation=np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])), up="-y")
+    fixes = fixes_of_frames(str(file), frame_set(120))
     with pytest.raises(GsbaError, match=r"gps\.csv: its positions fit the mirror image"):
-        placing._on_earth(run, frame_set(120), str(file), upright)
+        placing._on_earth(run, frame_set(120), file, fixes, upright)
 
 
 def test_frames_beyond_the_fixes_are_less_certain(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from walk_on_earth import ORIGIN, frame_set, geodetic_of, level_metres, walk_res
 from gsba.camera.sphere import erp_directions
 from gsba.config import PlacementSettings
 from gsba.export import ExportFormat, export
+from gsba.frames.recordings import combine
 from gsba.geometry import angular_errors, pose
 from gsba.log import GsbaError
 from gsba.placement import gravity
@@ -414,3 +415,50 @@ def test_tags_of_attitude_make_up_where_they_agree_with_poses(
         return
     error = np.degrees(np.arccos(np.clip(found.by_tags @ world.apply([0, -1, 0]), -1, 1)))
     assert error < 0.5
+
+
+@pytest.mark.parametrize("named", [False, True])
+def test_positions_of_the_first_recording_place_no_map_of_another(
+    tmp_path: Path, named: bool
+) -> None:
+    """A map without the first recording: its own positions are named after it, or later."""
+    result, frames = walk_result(), frame_set(40)
+    both = combine({name: _elsewhere(frames, tmp_path / name) for name in ("one", "two")})
+    second = both.taken(both.recordings["two"])
+    fixes = geodetic_of(level_metres(result))
+    path = write_fixes(tmp_path / "gps.csv", frames.timestamps, fixes)
+    if named:
+        rows = zip(frames.names, fixes.tolist(), strict=True)
+        lines = [",".join([f"{name}.jpg", *map(repr, fix)]) for name, fix in rows]
+        path.write_text("\n".join(["name,lat,lon,alt", *lines]))
+    settings = PlacementSettings(gps=str(path))
+    first = both.taken(both.recordings["one"])
+    placed = place(result, first, settings, whole=both)
+    assert placed.similarity.scale == pytest.approx(1 / 0.21, rel=1e-6)
+    with pytest.raises(GsbaError, match="0 of its positions are of refined frames"):
+        place(result, second, settings, whole=both)
+
+
+def test_true_poses_of_several_recordings_are_on_one_clock(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A recording that begins half a second late is a frame off on its own clock, as is said."""
+    result, alone = walk_result(), frame_set(40)
+    late = dataclasses.replace(alone, timestamps=alone.timestamps + 0.5)
+    both = combine({name: _elsewhere(late, tmp_path / name) for name in ("one", "two")})
+    write_tum(tmp_path / "t.tum", Trajectory(late.timestamps, result.world_T_rigs))
+    settings = PlacementSettings(align=str(tmp_path / "t.tum"))
+    place(result, late, settings)
+    assert not caplog.records
+    placed = place(result, both.taken(both.recordings["one"]), settings)
+    assert placed.grounds["align"]["rmse"] > 1e-2
+    assert "times are taken for those of the run's trajectory.tum" in caplog.text
+
+
+def _elsewhere(frames: FrameSet, folder: Path) -> FrameSet:
+    """The frames with files of their own."""
+    folder.mkdir()
+    paths = [folder / path.name for (path,) in frames.paths]
+    for path in paths:
+        path.write_text(str(path))
+    return dataclasses.replace(frames, paths=tuple((path,) for path in paths))

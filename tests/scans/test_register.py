@@ -174,3 +174,15 @@ def test_axes_of_a_room_are_its_walls() -> None:
     noisy = unit(normals + 0.05 * np.random.default_rng(2).standard_normal(normals.shape))
     found = np.abs(main_axes(noisy @ turn.T) @ turn)
     assert np.sort(found.max(axis=1))[0] > np.cos(np.radians(1)) and np.linalg.det(found) != 0
+
+
+def test_a_candidate_that_is_ruled_out_hides_no_other() -> None:
+    """The smallest scale that is tried is on the border of those allowed."""
+    run, surfaces = cloud(SIZE, HALL, 2, 400), scan(SIZE, MOVED, 2, num=4000)
+    for seed in range(3):
+        guess = Guess(scale=INTO_SCAN.scale * 1.03**seed)
+        wide = replace(guess, scale_ratio=guess.scale_ratio * (1 + 1e-12))
+        scales = [[fit.scale for fit in search._by_axes(run, surfaces, g)] for g in (guess, wide)]
+        inside = [s for s in scales[1] if s > 1.001 * guess.scale / guess.scale_ratio]
+        within = [s for s in scales[0] if s > 1.001 * guess.scale / guess.scale_ratio]
+        assert len(within) == len(inside) > 1000

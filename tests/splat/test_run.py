@@ -1,6 +1,7 @@
 """Splats of a run: views, start clouds, training and evaluation from the command line."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -80,6 +81,15 @@ def test_evaluate_compares_sources_and_resumes(case: Case, run: Path, tmp_path: 
     assert again == table
 
 
+def test_files_of_one_name_are_not_taken_for_one(run: Path, tmp_path: Path) -> None:
+    paths = [tmp_path / name / "slam/a.tum" for name in ("one", "two", "three")]
+    for path in paths:
+        path.parent.mkdir(parents=True)
+        path.write_bytes((run / "trajectory.tum").read_bytes())
+    against = [word for path in paths for word in ("--against", path)]
+    fails(run_gsba("evaluate", run, "--splat", *against), "another file goes by slam-a, too")
+
+
 def test_evaluate_needs_something_to_compare_with(run: Path) -> None:
     fails(run_gsba("evaluate", run), "--truth")
 
@@ -154,6 +164,26 @@ def test_panoramas_at_one_place_are_scored_apart() -> None:
     scores = measure(gaussians, views, TrainingOptions(), 0.01, CpuBackend(1))
     assert list(scores) == [0, 1] and scores[0].psnr > scores[1].psnr
     assert scores[1].psnr == pytest.approx(-20 * np.log10(128 / 255), abs=1e-3)
+
+
+def test_a_splat_is_trained_anew_where_other_frames_are_held_out(
+    case: Case, tmp_path: Path
+) -> None:
+    """Beside poses of fewer frames: a splat of before has seen those held out now."""
+    result, frames = case.result.reconstruction, case.result.frames
+    level = result.world_T_rigs.copy()
+    level[:, :3, :3] = np.eye(3)  # aligned to themselves to the last digit
+    result = replace(result, world_T_rigs=level)
+    settings = TrainingOptions(iterations=20, face_size=16)
+    few = level.copy()
+    few[:2] = np.nan
+    given = settings, CpuBackend(1)
+    alone = compare(result, frames, {"refined": level}, *given, tmp_path / "out")
+    beside = {"refined": level, "few": few}
+    after = compare(result, frames, beside, *given, tmp_path / "out")
+    anew = compare(result, frames, beside, *given, tmp_path / "new")
+    assert alone["refined"].frames.keys() != after["refined"].frames.keys()
+    assert after["refined"].mean == anew["refined"].mean
 
 
 def test_too_few_common_frames_are_refused(case: Case, tmp_path: Path) -> None:

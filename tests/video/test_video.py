@@ -14,9 +14,11 @@ from video_files import encode, steady, times_of
 from gsba.config import VideoSettings
 from gsba.frames.scan import scan
 from gsba.log import GsbaError
+from gsba.pipeline import inputs
+from gsba.trajectory.conventions import Convention
 from gsba.trajectory.files import write_tum
 from gsba.types import Trajectory
-from gsba.video import extract, extraction
+from gsba.video import extract, extraction, recording
 from gsba.video.colours import luma
 from gsba.video.likeness import apparent_motion_deg, miniature, sharpness
 
@@ -323,12 +325,38 @@ def test_a_black_video_is_refused_before_it_is_followed(
     fails(run_gsba(*chosen, "--sharpest"), "--every auto keeps sharp frames already")
 
 
+def test_headers_of_a_video_are_read_once(
+    film: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Checked, then extracted; anew when it is another file."""
+    read, video = list[object](), tmp_path / "film.mp4"
+    video.write_bytes(film.read_bytes())
+    given = recording.read_timeline
+    monkeypatch.setattr(recording, "read_timeline", lambda track: read.append(0) or given(track))
+    extraction.check_video(video, VideoSettings())
+    extract(video, tmp_path / "frames", VideoSettings())
+    assert len(read) == 1
+    video.write_bytes(film.read_bytes() + b"\0")
+    extraction.check_video(video, VideoSettings())
+    assert len(read) == 2
+
+
 def test_times_for_a_video_are_refused(film: Path, tmp_path: Path) -> None:
     """They would have no effect, but for a trajectory that has none of its own."""
     times = tmp_path / "times.csv"
     times.write_text("name,timestamp\n000000,0.0\n")
     done = run_gsba("refine", film, "--timestamps", times, "--out", tmp_path / "run")
     fails(done, "a video holds the times of its frames: leave out --timestamps")
+    write_tum(tmp_path / "a.tum", Trajectory(np.arange(2.0), np.tile(np.eye(4), (2, 1, 1))))
+    given = "--timestamps", times, "--out", tmp_path / "run"
+    done = run_gsba("refine", film, tmp_path / "a.tum", *given)
+    fails(done, "its frames, and its trajectory its own: leave out --timestamps")
+    rows = "1 0 0 0 0 1 0 0 0 0 1 0\n" * 2
+    (tmp_path / "kitti.txt").write_text(rows)
+    times.write_text("0.0\n0.5\n")
+    origin = {"frames": film, "trajectory": tmp_path / "kitti.txt"}
+    (found,) = inputs.read_trajectories(origin, times, Convention())
+    assert isinstance(found, Trajectory) and found.timestamps.tolist() == [0.0, 0.5]
 
 
 def test_fewer_frames_than_chosen_before_are_another_extraction(film: Path, tmp_path: Path) -> None:

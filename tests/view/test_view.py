@@ -24,12 +24,13 @@ from tiny_run import NUM_FRAMES, Case
 
 from gsba import view
 from gsba.camera.rig import RIG_R_FACE, CubeRig
+from gsba.export import ExportFormat, ExportOptions, export_all
 from gsba.geometry import rotation_from_quaternion
 from gsba.log import GsbaError
 from gsba.placement.world import Placement, read_placement
 from gsba.similarity import Sim3
 from gsba.splat import Gaussians, read_ply, write_ply
-from gsba.types import FACES
+from gsba.types import FACES, Reconstruction
 
 TURN = Rotation.from_rotvec([0.3, -0.8, 0.5]).as_matrix()
 PLACED = Placement(Sim3(2.5, TURN, np.array([3.0, -1.0, 7.0])), "m", "z")
@@ -108,6 +109,24 @@ def test_the_scene_is_placed_as_the_latest_export(run: Path, scene: view.RunScen
     turned = 2.5**2 * TURN @ scene.splats[0].covariances @ TURN.T
     assert np.allclose(placed.splats[0].covariances, turned, rtol=1e-4, atol=1e-6)
     assert np.allclose(placed.coarse_T_rigs[:, :3, :3], TURN @ scene.coarse_T_rigs[:, :3, :3])
+
+
+def test_a_map_is_not_placed_as_an_earlier_one_was(
+    run: Path, scene: view.RunScene, caplog: pytest.LogCaptureFixture
+) -> None:
+    """After a run was refined anew, exports of before have another unit, up and place."""
+    out, options = run / "metric", ExportOptions(placement=PLACED)
+    for poses, unit in ((scene.reconstruction, "m"), (_moved(scene.reconstruction), "map units")):
+        export_all(poses, scene.frames, {ExportFormat.PLY: out}, options)
+        try:
+            assert view.load_scene(run).unit == unit
+        finally:
+            shutil.rmtree(out)
+    assert "places an earlier map of the run: export again" in caplog.text
+
+
+def _moved(reconstruction: Reconstruction) -> Reconstruction:
+    return replace(reconstruction, world_T_rigs=reconstruction.world_T_rigs + 1e-3)
 
 
 def _positions(poses: np.ndarray | None) -> np.ndarray:
