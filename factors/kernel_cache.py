@@ -264,8 +264,6 @@ def _remove_unused(folder: Path) -> None:
 @cache
 def _tell_trouble(reason: str) -> None:
     logger.warning(
-        "compiled kernels cannot be kept in %s: %s; each process compiles them anew: set "
-        "NUMBA_CACHE_DIR to a folder that can be written",
-        cache_folder(),
-        reason,
+        f"compiled kernels cannot be kept in {cache_folder()}: {reason}; each process compiles "
+        "them anew: set NUMBA_CACHE_DIR to a folder that can be written"
     )

@@ -14,9 +14,8 @@ errors as variables; and as they are of the gauge that holds the first pose, the
 all by factors that are linear.
 """
 
-import hashlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import gtsam
@@ -99,13 +98,6 @@ class FrameFixes:
             return distances < MEDIAN_NORMAL_LENGTH * most, most
         return distances <= OUTLIER_LENGTH * scatter, scatter
 
-    def digest(self) -> str:
-        """Fingerprint of all that results rest on."""
-        times = np.zeros(0) if self.times is None else self.times
-        parts = self.frames, self.positions, self.sigmas, times, np.array([self.correlation_s])
-        data = b"".join(np.ascontiguousarray(part, np.float64).tobytes() for part in parts)
-        return hashlib.sha256(data).hexdigest()[:16]
-
     def correlations(self) -> np.ndarray:
         """Correlation (G - 1,) of the lasting part of the errors of each fix and the next."""
         if self.times is None:
@@ -167,10 +159,6 @@ class Anchors:
     fixes: FrameFixes  # (A) the same in level metres
     used: np.ndarray  # (G,) bool, fixes of the frames that are among them
     level_from_map: dict[int, Sim3]  # of each map that has fixes: metres east, north, up
-
-    def holds(self, frame: int, maps: np.ndarray | None) -> bool:
-        """Whether the map of a frame, of all maps (F,), has fixes; None = there is one map."""
-        return (0 if maps is None else int(maps[frame])) in self.level_from_map
 
     def weights(self, world_T_rigs: np.ndarray) -> np.ndarray:
         """Weights (A,) of the Cauchy loss under these poses (F, 4, 4)."""
@@ -298,7 +286,9 @@ class GpsFactors(Family):
     @property
     def digest(self) -> str:
         """Digest of the fixes and of the scale of the loss."""
-        return digest_of(self.fixes.digest(), LOSS_SIGMAS, self.contradicted)
+        fixes = self.fixes
+        measured = fixes.frames, fixes.positions, fixes.sigmas, fixes.times, fixes.correlation_s
+        return digest_of(*measured, LOSS_SIGMAS, self.contradicted)
 
     def fitted(self, snapshot: MapSnapshot) -> "AnchoredFixes | None":
         """The fixes in the world of these poses; None where these contradict them."""
@@ -345,43 +335,31 @@ class AnchoredFixes(Family):
 
     name = "gps"
     limits_drift = True
-
-    anchors: Anchors
-    digest: str
-
-    def holds_gauge(self, snapshot: MapSnapshot) -> bool:
-        """True if the map of the first frame has fixes."""
-        return self.anchors.holds(0, snapshot.maps)
-
-    def graph(self, snapshot: MapSnapshot) -> gtsam.NonlinearFactorGraph:
-        """A factor for each fix."""
-        return factors(self.anchors)
-
-    def for_covariances(self, snapshot: MapSnapshot) -> "LastingErrors":
-        """The fixes with their lasting errors as variables."""
-        return LastingErrors(self.anchors, self.digest)
-
-
-@dataclass(frozen=True, slots=True)
-class LastingErrors(Family):
-    """Linear factors of fixes whose lasting errors are variables: see `linear_factors`."""
-
-    name = "gps"
     reserved_letters = "es"
 
     anchors: Anchors
     digest: str
+    lasting: bool = False  # their lasting errors are variables: see `linear_factors`
 
-    def variables(self, snapshot: MapSnapshot) -> gtsam.Values:
-        """Lasting errors of fixes, and similarities of maps."""
-        return self._linear(snapshot)[1]
+    def holds_gauge(self, snapshot: MapSnapshot) -> bool:
+        """True if the map of the first frame has fixes."""
+        return int(snapshot.maps[0]) in self.anchors.level_from_map
 
     def graph(self, snapshot: MapSnapshot) -> gtsam.NonlinearFactorGraph:
-        """Linear factors, weighted by the loss at these poses."""
-        return self._linear(snapshot)[0]
+        """A factor for each fix, or linear ones, weighted by the loss at these poses."""
+        if self.lasting:
+            return linear_factors(self.anchors, snapshot.world_T_rigs)[0]
+        return factors(self.anchors)
 
-    def _linear(self, snapshot: MapSnapshot) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-        return linear_factors(self.anchors, snapshot.world_T_rigs)
+    def variables(self, snapshot: MapSnapshot) -> gtsam.Values:
+        """None, or lasting errors of fixes and similarities of maps."""
+        if self.lasting:
+            return linear_factors(self.anchors, snapshot.world_T_rigs)[1]
+        return gtsam.Values()
+
+    def for_covariances(self, snapshot: MapSnapshot) -> "AnchoredFixes":
+        """The fixes with their lasting errors as variables."""
+        return replace(self, lasting=True)
 
 
 def factors(anchors: Anchors) -> gtsam.NonlinearFactorGraph:

@@ -59,17 +59,8 @@ def align(
     counts = Counts(len(f_R_nexts), num_known, "steps", dropped)
     if len(turns) < MIN_STEPS:
         clock, nan = Clock(float(timestamps[0]), 0.0, 1.0), float("nan")
-        return Alignment(
-            clock,
-            nan,
-            Sensor.ideal(),
-            np.eye(3),
-            nan,
-            nan,
-            0.0,
-            counts,
-            f"only {len(turns)} rotations are known from images",
-        )
+        why = f"only {len(turns)} rotations are known from images"
+        return Alignment(clock, nan, Sensor.ideal(), np.eye(3), nan, nan, 0.0, counts, why)
     if former is None:
         starts = [(p, np.zeros(3)) for p in _candidates(turns, readings)]  # no bias
     else:
@@ -225,41 +216,42 @@ def _with_reason(
     """The alignment of the best candidate, with the reason if it is rejected."""
     fit, parameters, turns = best.fit, best.parameters, best.turns
     sigma = noise(fit.residuals(parameters))
-    share = fit.explained(parameters, sigma)
     begin = turns.middle - timestamps[0]
     offset = parameters[0] - (parameters[1] - 1) * begin
     # steady gyros on the move are no better
-    found = Alignment(
+    return Alignment(
         Clock(float(timestamps[0]), float(offset), float(parameters[1])),
         float(np.sqrt(fit.covariance(parameters, with_rate=False)[0, 0])),
         best.sensor,
         best.rig_R_imu,
         best.axes_sigma,
         noise(fit.residuals(parameters), np.deg2rad(0.003)),
-        share,
+        fit.explained(parameters, sigma),
         counts,
+        _why_rejected(best, others, sigma),
     )
+
+
+def _why_rejected(best: _Candidate, others: list[_Candidate], sigma: float) -> str:
+    """Why the best candidate, which leaves noise `sigma`, is not used; "" = it is."""
+    fit, parameters, turns = best.fit, best.parameters, best.turns
+    share = fit.explained(parameters, sigma)
     rivals = [o for o in others if abs(o.parameters[0] - parameters[0]) > turns.step]
     rival = max((one.fit.explained(one.parameters, sigma) for one in rivals), default=0.0)
     # a tenth of the steps must turn by a degree
     if np.quantile(np.linalg.norm(turns.rotvecs, axis=1), 0.9) < np.deg2rad(1.0):
-        return replace(found, reason="the camera turns too little to determine the gyro's clock")
+        return "the camera turns too little to determine the gyro's clock"
     reversed_ = replace(best.readings, rates=-best.readings.rates)
     other = _Candidate.of(turns, reversed_, parameters, -best.sensor.bias).fit
     if noise(other.residuals(parameters)) < 0.5 * sigma:  # of a mirror image of the axes
-        return replace(
-            found,
-            reason="the gyro's axes are left-handed: one is reversed, or two are exchanged",
-        )
+        return "the gyro's axes are left-handed: one is reversed, or two are exchanged"
     if share < _MIN_EXPLAINED or fit.turning(sigma).sum() < MIN_TURNS:
-        return replace(found, reason="the gyro's rotations fit the images at no clock offset")
+        return "the gyro's rotations fit the images at no clock offset"
     if rival > 0.75 * share:  # share of the best offset's explained turns that no rival may reach
-        return replace(found, reason="the gyro's rotations fit the images at several clock offsets")
+        return "the gyro's rotations fit the images at several clock offsets"
     if best.axes_sigma > np.deg2rad(5.0):
-        return replace(
-            found, reason="the camera turns about one axis only: the gyro's axes are undetermined"
-        )
-    return found
+        return "the camera turns about one axis only: the gyro's axes are undetermined"
+    return ""
 
 
 def up_axis(
@@ -299,9 +291,8 @@ def up_axis(
     scatter = float(np.degrees(np.median(np.arccos(np.clip(directions @ up, -1, 1)))))
     if scatter > _MAX_UP_SCATTER_DEG:
         logger.warning(
-            "the accelerometer is not used: its vertical turns with the camera, by %.0f degrees in "
-            "the median: check that its axes are those of the gyro",
-            scatter,
+            f"the accelerometer is not used: its vertical turns with the camera, by {scatter:.0f} "
+            "degrees in the median: check that its axes are those of the gyro"
         )
         return None
     return up

@@ -31,16 +31,11 @@ from gsba.localization.patch_sightings import PatchAligner
 from gsba.localization.picture_cameras import PictureCameras
 from gsba.localization.pictures import load_panorama
 from gsba.localization.place_index import PlaceIndex, index_path, load_or_make, make_index
-from gsba.localization.pose_search import (
-    Candidates,
-    PlacedPose,
-    best_of,
-    is_significant,
-    search_poses,
-)
+from gsba.localization.pose_search import Candidates, PlacedPose, best_of, search_poses
 from gsba.localization.run_map import Query, RunMap, without_correction
 from gsba.localization.surroundings import Surroundings, open_rates
 from gsba.log import GsbaError
+from gsba.matching.absolute_pose import is_significant
 from gsba.matching.guided_search import Gate, match_pair, searchable
 from gsba.trajectory.limits import TwoViewLimits
 from gsba.types import Features, FrameSet, Keypoints
@@ -359,7 +354,7 @@ class Localizer:
         inliers, covariance = fitted.inliers[0], fitted.covariances[0]
         world_T_rig, noise = fitted.world_T_rigs[0], float(fitted.noises[0])
         sigma = noise * typical_sigma(seen.spreads)
-        chance = min((GATE_SIGMAS * sigma / _NARROW_GATE_RAD) ** 2, 0.5)
+        chance = (GATE_SIGMAS * sigma / _NARROW_GATE_RAD) ** 2
         if not is_significant(candidates.bearings, inliers, chance):
             return LocalizedFrame.refused(name, NO_PLACE)
         if not is_determined(world_T_rig, covariance, candidates.points_world[inliers]):

@@ -38,19 +38,18 @@ from gsba.localization.photos import (
     shows,
 )
 from gsba.localization.pictures import QueryPicture
-from gsba.localization.pose_search import (
-    LOOK_ALIKE,
-    MIN_RATIO,
-    MIN_WITNESSES,
-    TWO_PLACES,
-    Candidates,
-    is_significant,
-)
+from gsba.localization.pose_search import LOOK_ALIKE, MIN_RATIO, TWO_PLACES, Candidates
 from gsba.localization.run_map import Query
 from gsba.localization.surroundings import is_contradicted
 from gsba.log import GsbaError, track
 from gsba.loop_closure.join_evidence import JoinEvidence
-from gsba.matching.absolute_pose import FoundPose, are_apart, camera_pose
+from gsba.matching.absolute_pose import (
+    MIN_WITNESSES,
+    FoundPose,
+    are_apart,
+    camera_pose,
+    is_significant,
+)
 from gsba.matching.guided_search import searchable
 from gsba.types import Features
 from gsba.types.records import with_rows
@@ -181,7 +180,7 @@ def _refine(
         fitted = fit([seen], pose[None], scales, [projection], [belief])
     pose, projection = fitted.world_T_rigs[0], _perspective(fitted.projections[0])
     sigma = float(fitted.noises[0]) * typical_sigma(seen.spreads) / projection.focal
-    chance = min((GATE_SIGMAS * sigma / _GATES_RAD[-1]) ** 2, 0.5)
+    chance = (GATE_SIGMAS * sigma / _GATES_RAD[-1]) ** 2
     given = candidates.bearings, fitted.inliers[0], chance  # no sample of them chose the pose
     if not is_significant(*given, sample=0, per_side=_CELLS_PER_SIDE):
         return None

@@ -7,16 +7,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsba.camera.rig import cells_of, witnesses
+from gsba.camera.rig import cells_of
 from gsba.localization.surroundings import is_look_alike
 from gsba.loop_closure.join_evidence import JoinEvidence
-from gsba.matching.absolute_pose import FoundPose, are_apart, panorama_pose
-from gsba.significance import MAX_FALSE_POSES, SIGMAS_OF_1E_3, least_agreeing
+from gsba.matching.absolute_pose import (
+    MIN_WITNESSES,
+    FoundPose,
+    are_apart,
+    is_significant,
+    panorama_pose,
+)
+from gsba.significance import SIGMAS_OF_1E_3
 from gsba.trajectory.turning import CELLS_PER_SIDE
 from gsba.types.records import with_rows
 
 MIN_RATIO = 0.02  # least inlier ratio that the number of trials allows for
-MIN_WITNESSES = 10  # fewer may be of one moving object
 _MIN_SHARE = 0.25  # of the first pose's inliers, that further poses must have
 TWO_PLACES = "two places of the map look like it"
 LOOK_ALIKE = "the place that it looks like shows other things around"
@@ -50,31 +55,6 @@ def search_poses(
         found.append(one)
         candidates = with_rows(candidates, ~one.inliers)
     return found
-
-
-def is_significant(
-    bearings: np.ndarray,
-    inliers: np.ndarray,
-    chance: float,
-    sample: int = 3,
-    per_side: int = CELLS_PER_SIDE,
-) -> bool:
-    """True if chance does not explain a pose's inliers, counted in independent witnesses.
-
-    Args:
-        bearings: (m, 3) of all candidates.
-        inliers: (m,) bool.
-        chance: probability that a false candidate agrees with an unrelated pose.
-        sample: candidates whose pose it is; 0 = it was known without them.
-        per_side: cells along a face's side, of 90 degrees: candidates within one are one witness.
-    """
-    if not inliers.any():
-        return False
-    num = witnesses(bearings, per_side)
-    agreeing = witnesses(bearings[inliers], per_side)
-    per_witness = 1 - (1 - min(chance, 0.5)) ** (len(bearings) / num)
-    needed = least_agreeing(num, per_witness, sample, MAX_FALSE_POSES)
-    return agreeing >= max(needed, MIN_WITNESSES)
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,14 +6,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from gsba.camera.rig import witnesses
 from gsba.camera.sphere import erp_from_bearings
 from gsba.geometry import inverse, pose, rotation_angle
+from gsba.significance import MAX_FALSE_POSES, least_agreeing
+from gsba.trajectory.turning import CELLS_PER_SIDE
 
 if TYPE_CHECKING:
     import pycolmap
 
 _PANORAMA_WIDTH_PX = 4096  # of the virtual panorama
 _MIN_TRIALS, _MAX_TRIALS = 100, 10_000
+MIN_WITNESSES = 10  # fewer may be of one moving object
 _APART = 0.3  # distance of another place, in median depths or radians
 
 
@@ -36,6 +40,33 @@ def are_apart(one: np.ndarray, other: np.ndarray, depth: float) -> bool:
     moved = inverse(one) @ other
     turned = float(rotation_angle(moved[:3, :3]))
     return max(float(np.linalg.norm(moved[:3, 3])) / depth, turned) > _APART
+
+
+def is_significant(
+    bearings: np.ndarray,
+    inliers: np.ndarray,
+    chance: float,
+    sample: int = 3,
+    per_side: int = CELLS_PER_SIDE,
+    least: int = MIN_WITNESSES,
+) -> bool:
+    """True if chance does not explain a pose's inliers, counted in independent witnesses.
+
+    Args:
+        bearings: (m, 3) of all candidates.
+        inliers: (m,) bool.
+        chance: probability that a false candidate agrees with an unrelated pose.
+        sample: candidates whose pose it is; 0 = it was known without them.
+        per_side: cells along a face's side, of 90 degrees: candidates within one are one witness.
+        least: witnesses that are needed in any case.
+    """
+    if not inliers.any():
+        return False
+    num = witnesses(bearings, per_side)
+    agreeing = witnesses(bearings[inliers], per_side)
+    per_witness = 1 - (1 - min(chance, 0.5)) ** (len(bearings) / num)
+    needed = least_agreeing(num, per_witness, sample, MAX_FALSE_POSES)
+    return agreeing >= max(needed, least)
 
 
 def panorama_pose(

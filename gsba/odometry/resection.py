@@ -7,9 +7,7 @@ import numpy as np
 
 from factors import tangent_basis
 from factors.compiled import kernel_and_part
-from gsba.camera.rig import witnesses
-from gsba.significance import MAX_FALSE_POSES, least_agreeing
-from gsba.trajectory.turning import CELLS_PER_SIDE
+from gsba.matching.absolute_pose import is_significant
 
 _kernel, _part = kernel_and_part()
 _CONVERGED = 1e-6  # radians, and parts of the median distance
@@ -43,16 +41,12 @@ def resect(
         noise = float(np.sqrt(np.median(squares[inliers]) / 1.386))
     distance = float(np.median(distances)) if len(distances) else 1.0
     covariance = max(noise, 0.3 * sigma) ** 2 * np.linalg.pinv(information, hermitian=True)
-    num = witnesses(bearings_rig, CELLS_PER_SIDE) if len(bearings_rig) else 0
-    agreeing = witnesses(bearings_rig[inliers], CELLS_PER_SIDE) if inliers.any() else 0
     # false matches lie anywhere within 6 degrees of their prediction
-    chance = min((_GATE * sigma / np.deg2rad(6.0)) ** 2, 0.5)
-    per_witness = 1 - (1 - chance) ** (len(bearings_rig) / max(num, 1))
-    needed = least_agreeing(num, per_witness, 3, MAX_FALSE_POSES)  # 3 bearings give a pose
-    significant = agreeing >= max(needed, _MIN_WITNESSES)
+    chance = (_GATE * sigma / np.deg2rad(6.0)) ** 2
+    significant = is_significant(bearings_rig, inliers, chance, least=_MIN_WITNESSES)
     spread = np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1])
-    significant &= spread < 0.05 * distance  # of the position, in median distances of the points
-    return Resection(pose, inliers, noise, covariance, bool(significant))
+    significant &= bool(spread < 0.05 * distance)  # of the position, in median distances of points
+    return Resection(pose, inliers, noise, covariance, significant)
 
 
 def _fitted(

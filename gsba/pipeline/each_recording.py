@@ -131,19 +131,13 @@ def _turning(parts: Sequence[tuple[GyroConstraints | None, int]]) -> GyroConstra
     known = [turning for turning, _ in parts if turning is not None]
     if not known:
         return None
-    steps, sigmas, rates = list[np.ndarray](), list[np.ndarray](), list[np.ndarray]()
+    every = list[GyroConstraints]()
     for turning, num in parts:
-        if turning is None:
-            steps.append(np.zeros((num, 3)))
-            sigmas.append(np.full(num, np.inf))
-            rates.append(np.full((num, 3), np.nan))
-            continue
-        steps += [turning.steps, np.zeros((1, 3))]
-        sigmas += [turning.step_sigmas, np.full(1, np.inf)]
-        rates.append(turning.rates)
+        nothing = np.zeros((num - 1, 3)), np.full(num - 1, np.inf), np.full((num, 3), np.nan)
+        every.append(turning or GyroConstraints(*nothing, 0.0))
     return GyroConstraints(
-        np.concatenate(steps)[:-1],
-        np.concatenate(sigmas)[:-1],
-        np.concatenate(rates),
-        max(turning.rate_sigma for turning in known),
+        _steps([one.steps for one in every], np.zeros(3)),
+        _steps([one.step_sigmas for one in every], np.inf),
+        np.concatenate([one.rates for one in every]),
+        max(one.rate_sigma for one in every),
     )

@@ -5,7 +5,7 @@ import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -185,11 +185,11 @@ def add_recordings(
         finished = FinishedRun.load(root)
         names = names_of(recordings)
         _refuse_known(finished, recordings, names)
-        place = _Place.of(root, out)
+        place = _place_of(root, out)
         given = {
             f"{name}: frames": Path(one.frames) for name, one in zip(names, recordings, strict=True)
         }
-        with place.store(finished.origin | given, client, finished) as work:
+        with _store_beside(place, finished.origin | given, client, finished) as work:
             scratch = work.root / SCRATCH
             named = [replace(one, name=name) for one, name in zip(recordings, names, strict=True)]
             settings = finished.settings  # less what places its result
@@ -233,7 +233,7 @@ def add_recordings(
                 held = np.flatnonzero(_define_worlds(maps, merged.components)[: maps.starts[1]])
                 state = map_joining.hold(state, held)
             state = map_joining.tie(state, maps.parts)
-            return place.finish(work, state, maps, held=held)
+            return _finish(place, work, state, maps, held=held)
 
 
 @threadpool_limits.wrap(limits=1, user_api="blas")  # sums keep their order
@@ -266,7 +266,7 @@ def merge_runs(
     for root, path in zip(roots, resolved, strict=True):
         if resolved.count(path) > 1:
             raise GsbaError(f"{root} is given twice: give each run once")
-    place = _Place.of(None, out)
+    place = _place_of(None, out)
     with held_runs(roots):
         finished = [FinishedRun.load(root) for root in roots]
         known: dict[Path, FinishedRun] = {}
@@ -279,14 +279,14 @@ def merge_runs(
                     )
         refuse_fields(finished, len(JointCameras.of(finished).formats) > 1)
         origin = {what: path for run in finished for what, path in run.origin.items()}
-        with place.store(origin, client, finished[0]) as work:
+        with _store_beside(place, origin, client, finished[0]) as work:
             state, maps = _joined(work, finished)
             _require_any_joined(maps, state)
             if not rigid:
-                return place.finish(work, map_joining.tie(state, maps.parts), maps)
+                return _finish(place, work, map_joining.tie(state, maps.parts), maps)
             moves = map_joining.align_rigidly(state, maps.parts)
             state = map_joining.moved_rigidly(state, maps.parts, moves, maps.unit_frames())
-            return place.finish(work, state, maps, rigid=moves)
+            return _finish(place, work, state, maps, rigid=moves)
 
 
 @threadpool_limits.wrap(limits=1, user_api="blas")  # sums keep their order
@@ -326,68 +326,62 @@ def remove_recordings(
                 f"{finished.root} has no other recording than {', '.join(known)}: one must stay"
             )
         left = finished.without(names)
-        place = _Place.of(root, out)
-        with place.store(left.origin, None, left) as work:
+        place = _place_of(root, out)
+        with _store_beside(place, left.origin, None, left) as work:
             maps = JointMaps.of([left])
             state = map_joining.begin(work, maps, left.settings)
-            return place.finish(work, map_joining.adjust(state), maps)
+            return _finish(place, work, map_joining.adjust(state), maps)
 
 
-@dataclass(frozen=True, slots=True)
-class _Place:
-    """Where a run that grows is written."""
+def _place_of(root: Path | None, out: Path | str | None) -> Path:
+    """Where the result of a run that grows is written; GsbaError if there is something."""
+    if root is not None and (out is None or Path(out).resolve() == root.resolve()):
+        return with_own_name(root)
+    assert out is not None
+    out = with_own_name(Path(out))
+    if out.is_symlink() or (out.exists() and not (out.is_dir() and not any(out.iterdir()))):
+        raise GsbaError(f"{out} exists: choose another --out")
+    if not out.parent.is_dir():
+        raise GsbaError(f"{out.parent} is no folder: make it, or choose another --out")
+    return out
 
-    out: Path
 
-    @classmethod
-    def of(cls, root: Path | None, out: Path | str | None) -> "_Place":
-        """A place for the result of a run that grows; GsbaError if there is something."""
-        if root is not None and (out is None or Path(out).resolve() == root.resolve()):
-            return cls(with_own_name(root))
-        assert out is not None
-        out = with_own_name(Path(out))
-        if out.is_symlink() or (out.exists() and not (out.is_dir() and not any(out.iterdir()))):
-            raise GsbaError(f"{out} exists: choose another --out")
-        if not out.parent.is_dir():
-            raise GsbaError(f"{out.parent} is no folder: make it, or choose another --out")
-        return cls(out)
+@contextmanager
+def _store_beside(
+    out: Path, origin: dict[str, Path], client: "Client | None", first: FinishedRun
+) -> Iterator[RunStore]:
+    """Store of the run in a folder beside its place, taken up where a call was interrupted.
 
-    @contextmanager
-    def store(
-        self, origin: dict[str, Path], client: "Client | None", first: FinishedRun
-    ) -> Iterator[RunStore]:
-        """Store of the run in a folder beside its place, taken up where a call was interrupted.
+    The folder is deleted where maps turn out not to be of one place.
+    """
+    work = out.with_name(f".{out.name}.growing")
+    forget_other_work(work, origin, out)
+    hired = cluster.hire(client, first.frames.paths[0][0], first.settings)
+    try:
+        with RunStore(work, origin, hire=hired, title_of=title_of) as store:
+            yield store
+    except ApartError:
+        shutil.rmtree(work, ignore_errors=True)
+        raise
 
-        The folder is deleted where maps turn out not to be of one place.
-        """
-        work = self.out.with_name(f".{self.out.name}.growing")
-        forget_other_work(work, origin, self.out)
-        hired = cluster.hire(client, first.frames.paths[0][0], first.settings)
-        try:
-            with RunStore(work, origin, hire=hired, title_of=title_of) as store:
-                yield store
-        except ApartError:
-            shutil.rmtree(work, ignore_errors=True)
-            raise
 
-    def finish(
-        self,
-        store: RunStore,
-        state: State,
-        maps: JointMaps,
-        *,
-        held: np.ndarray | None = None,
-        rigid: RigidMoves | None = None,
-    ) -> RunResult:
-        """Write the result and put it in place; frames `held` (H,) kept their poses, maps of
-        `rigid` were moved by similarities; None = all were solved together."""
-        written = _write(state, maps, held, rigid)
-        sources = [*(run.root for run in maps.runs), store.root]
-        frames = complete(store, state.run.frames, sources, self.out)
-        before = put_in_place(store.root, self.out)
-        if before is not None:
-            logger.info("the run as it was: %s; delete it whenever you like", before)
-        return replace(written, out=self.out, frames=frames)
+def _finish(
+    out: Path,
+    store: RunStore,
+    state: State,
+    maps: JointMaps,
+    *,
+    held: np.ndarray | None = None,
+    rigid: RigidMoves | None = None,
+) -> RunResult:
+    """Write the result and put it in place; frames `held` (H,) kept their poses, maps of `rigid`
+    were moved by similarities; None = all were solved together."""
+    written = _write(state, maps, held, rigid)
+    frames = complete(store, state.run.frames, [*(run.root for run in maps.runs), store.root], out)
+    before = put_in_place(store.root, out)
+    if before is not None:
+        logger.info("the run as it was: %s; delete it whenever you like", before)
+    return replace(written, out=out, frames=frames)
 
 
 def _joined(store: RunStore, runs: Sequence[FinishedRun]) -> tuple[State, JointMaps]:
@@ -445,7 +439,7 @@ def _define_worlds(maps: JointMaps, components: np.ndarray) -> np.ndarray:
 def _write(
     state: State, maps: JointMaps, held: np.ndarray | None, rigid: RigidMoves | None
 ) -> RunResult:
-    """Covariances, and all that a run leaves behind; arguments as of `_Place.finish`."""
+    """Covariances, and all that a run leaves behind; arguments as of `_finish`."""
     components = state.prior.parts
     if components is None:
         components = np.zeros(len(state.run.frames), np.int64)

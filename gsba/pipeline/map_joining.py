@@ -214,15 +214,10 @@ def tie(state: State, parts: np.ndarray) -> State:
     ties = _crossing(state, parts)
     if not len(ties):
         raise ApartError(_NOT_TIED.format("share no points there"))
-    base = _sighted(state)
-    both, order = _interleaved(base.keypoints, state.observed.shown)
-    sizes = np.diff(base.keypoints.starts)
-    everything = Sighted(
-        both,
-        np.concatenate([base.aligned, np.zeros(len(order) - len(base.aligned), bool)])[order],
-        Tracks.joined([base.tracks, replace(ties, keypoints=ties.keypoints + sizes[ties.frames])]),
-        base.counts,
-    )
+    base, shown = _sighted(state), state.observed.shown
+    tied = Sighted(shown, np.zeros(len(shown.faces), bool), ties, base.counts)
+    everything, order = _together(base, tied)
+    everything = replace(everything, normals_rig=None)
     solved = _solved(state, everything, "joined", run.settings.rounds.loops)
     if solved is None:
         raise ApartError(_NOT_TIED.format("lose points when they are adjusted together"))
@@ -258,21 +253,7 @@ def _aligned(state: State, base: Sighted, features: Keypoints, parts: np.ndarray
             break
         if n > 1:
             left, shared = _align_around(state, parts, f"align{n}")
-        keypoints, order = _interleaved(left.keypoints, shared.keypoints)
-        sizes, tracks = np.diff(left.keypoints.starts), shared.tracks
-        tracks = replace(tracks, keypoints=tracks.keypoints + sizes[tracks.frames])
-        normals = []
-        for one in (left, shared):
-            nothing = np.zeros((len(one.aligned), 3), np.float32)
-            normals.append(nothing if one.normals_rig is None else one.normals_rig)
-        both = Sighted(
-            keypoints,
-            np.concatenate([left.aligned, shared.aligned])[order],
-            Tracks.joined([left.tracks, tracks]),
-            shared.counts,
-            np.concatenate(normals)[order],
-        )
-        solved = _solved(state, both, f"aligned{n}")
+        solved = _solved(state, _together(left, shared)[0], f"aligned{n}")
         if solved is None:
             break
         before, state, better = state, solved, solved
@@ -441,11 +422,24 @@ def _sighted(state: State) -> Sighted:
     return Sighted(map_.observed, map_.confirmed, *seen)
 
 
-def _interleaved(one: Keypoints, other: Keypoints) -> tuple[Keypoints, np.ndarray]:
-    """Keypoints of both, in each frame those of `one` first, and their order among both (N,)."""
-    frames = np.concatenate([one.frames(), other.frames()])
-    order = np.argsort(frames, kind="stable")
-    return joined_keypoints([one, other]).at(order, one.starts + other.starts), order
+def _together(one: Sighted, other: Sighted) -> tuple[Sighted, np.ndarray]:
+    """Observations of both, in each frame those of `one` first, counted as those of `other`, and
+    the order of their keypoints among both (N,)."""
+    first, second, tracks = one.keypoints, other.keypoints, other.tracks
+    order = np.argsort(np.concatenate([first.frames(), second.frames()]), kind="stable")
+    moved = tracks.keypoints + np.diff(first.starts)[tracks.frames]
+    normals = list[np.ndarray]()
+    for some in (one, other):
+        unknown = np.zeros((len(some.aligned), 3), np.float32)
+        normals.append(unknown if some.normals_rig is None else some.normals_rig)
+    both = Sighted(
+        joined_keypoints([first, second]).at(order, first.starts + second.starts),
+        np.concatenate([one.aligned, other.aligned])[order],
+        Tracks.joined([one.tracks, replace(tracks, keypoints=moved)]),
+        other.counts,
+        np.concatenate(normals)[order],
+    )
+    return both, order
 
 
 def _without_same(base: Sighted, shared: Sighted, width: int) -> Sighted:

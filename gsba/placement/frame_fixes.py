@@ -142,11 +142,8 @@ def _locked(source: str, fixes: GpsFixes) -> GpsFixes:
     if locked.all():
         return fixes
     logger.warning(
-        "--gps %s: %d of %d positions are no fixes: they are latitude 0, longitude 0, or repeat "
-        "the position before",
-        source,
-        np.sum(~locked),
-        len(places),
+        f"--gps {source}: {np.sum(~locked)} of {len(places)} positions are no fixes: they are "
+        "latitude 0, longitude 0, or repeat the position before"
     )
     rows = np.flatnonzero(locked).tolist()
     return replace(
@@ -167,11 +164,9 @@ def _on_one_clock(source: str, frames: FrameSet, times: np.ndarray) -> np.ndarra
         if begin < _UNIX_S and any(begin <= other[1] and other[0] <= end for other in spans):
             told[rows] = False
             logger.warning(
-                "--gps %s: its times are those of an earlier recording, not of '%s', whose clock "
-                "shows the same: give positions of both by name, as '%s'",
-                source,
-                name,
-                frames.names[rows[0]],
+                f"--gps {source}: its times are those of an earlier recording, not of '{name}', "
+                "whose clock shows the same: give positions of both by name, as "
+                f"'{frames.names[rows[0]]}'"
             )
         else:
             spans.append((begin, end))

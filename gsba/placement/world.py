@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from gsba.disk import write_json
 from gsba.geometry import local_origin, pose
 from gsba.log import GsbaError
 from gsba.similarity import Sim3
@@ -94,8 +95,7 @@ class Placement:
 
     def write(self, path: Path) -> None:
         """Write transform.json."""
-        text = json.dumps(self.to_json(), indent=1, allow_nan=False) + "\n"
-        path.write_text(text, encoding="utf-8")
+        write_json(path, self.to_json())
 
 
 def read_placement(path: Path) -> Placement:

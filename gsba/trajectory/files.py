@@ -2,7 +2,6 @@
 
 import logging
 import math
-import os
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from gsba.disk import write_bytes
 from gsba.frames.times import read_lines, read_times, seconds
 from gsba.geometry import (
     as_rotations,
@@ -101,14 +101,7 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
         " ".join([repr(float(time)), *(f"{value:.15g}" for value in row)]) + "\n"
         for time, row in zip(trajectory.timestamps, values, strict=True)
     ]
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        temporary.write_text("".join(lines), encoding="ascii")
-        os.replace(temporary, path)
-    except OSError as error:
-        raise GsbaError(f"{path}: cannot be written ({error.strerror})") from None
-    finally:
-        temporary.unlink(missing_ok=True)
+    write_bytes(path, "".join(lines).encode("ascii"), parents=False)
 
 
 def _read_tum(path: Path, rows: Sequence[tuple[int, str]]) -> Trajectory:
@@ -135,13 +128,9 @@ def _tracked(
         )
     if len(lost):
         _log.warning(
-            "%s: %d of %d rows without a pose, as of lost frames (NaN, zeros, or positions beyond "
-            "%g; the first is %s): left out",
-            path,
-            len(lost),
-            len(known),
-            MAX_COORDINATE,
-            where[lost[0]],
+            f"{path}: {len(lost)} of {len(known)} rows without a pose, as of lost frames (NaN, "
+            f"zeros, or positions beyond {MAX_COORDINATE:g}; the first is {where[lost[0]]}): left "
+            "out"
         )
     return np.flatnonzero(known)
 

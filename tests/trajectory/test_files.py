@@ -243,7 +243,7 @@ def test_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
         write_tum(path, bad)
     assert path.read_text() == "old" and len(list(tmp_path.iterdir())) == 1
     good = Trajectory(np.array([0.0, 1.0]), np.stack([np.eye(4)] * 2))
-    refused("cannot be written", write_tum, tmp_path / "no" / "a.tum", good)
+    refused("cannot write", write_tum, tmp_path / "no" / "a.tum", good)
 
 
 def test_poses_that_are_none_are_not_written(tmp_path: Path) -> None:
