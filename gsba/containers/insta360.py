@@ -18,7 +18,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from gsba.containers.protobuf import read_message
-from gsba.log import GsbaError, brief
+from gsba.log import GsbaError
 
 _SIGNATURE = b"8db42d694ccc418790edff439fe026bf"
 _HEADER = struct.Struct("<32xII32s")  # size of the trailer with this header, version, signature
@@ -76,11 +76,6 @@ class GyroRecord:
     rates: np.ndarray  # (N, 3) float64, rad/s
     accelerations: np.ndarray  # (N, 3) float64, m/s^2, about 9.8 long at rest
 
-    @property
-    def rate_hz(self) -> float:
-        """Readings per second, by the median step; NaN for a single reading."""
-        return 1 / float(np.median(np.diff(self.times))) if len(self.times) > 1 else float("nan")
-
 
 @dataclass(frozen=True, slots=True)
 class ExposureRecord:
@@ -135,30 +130,6 @@ class Insta360Trailer:
     def has_frame_clock(self) -> bool:
         """True if times count from the first frame."""
         return self.first_frame_s is not None
-
-    def summary(self) -> list[str]:
-        """Lines of text on camera, gyro, exposures, positions, calibration, and notes."""
-        lines = [f"camera: {self.model or 'Insta360'}, firmware {self.firmware or 'not stated'}"]
-        if self.gyro is None:
-            lines.append("gyro: none")
-        else:
-            since = "the first frame" if self.has_frame_clock else "the first reading"
-            lines.append(
-                f"gyro: {len(self.gyro.times):,} readings at {self.gyro.rate_hz:.0f} Hz, "
-                f"{self.gyro.times[0]:.3f} to {self.gyro.times[-1]:.3f} s from {since}"
-            )
-        for name, of_lens in (("front", self.exposures), ("back", self.back_exposures)):
-            if of_lens is not None:
-                low, high = 1e3 * of_lens.durations.min(), 1e3 * of_lens.durations.max()
-                lines.append(
-                    f"exposures: {len(of_lens.times):,} of the {name} lens, {low:.2f} to "
-                    f"{high:.2f} ms"
-                )
-        lines.append(f"GPS: {0 if self.gps is None else len(self.gps.unix_times):,} fixes")
-        if self.readout_s is not None:
-            lines.append(f"readout: {1e3 * self.readout_s:.2f} ms")
-        known = f"by the maker: {brief(self.lens_strings[0])}" if self.lens_strings else "none"
-        return [*lines, f"lens calibration: {known}", *self.notes]
 
 
 def read_trailer(path: Path, telemetry: bool = True) -> Insta360Trailer | None:
