@@ -93,11 +93,8 @@ def evaluate_splat(
     out = run / "splat-evaluation"
     others = {}
     for path in against:
-        name = (
-            path.stem
-            if path.stem not in ("refined", *others)
-            else f"{path.parent.name}-{path.stem}"
-        )
+        taken = path.stem in ("refined", *others)
+        name = f"{path.parent.name}-{path.stem}" if taken else path.stem
         others[name] = read_trajectory(path)
     results = _compare(run, others, settings, out, lpips)
     typer.echo(format_table(results))

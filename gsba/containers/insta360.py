@@ -28,7 +28,6 @@ _VERSION = 3
 _MAX_RECORDS = 256
 _MAX_METADATA_BYTES = 8 << 20
 _MAX_RECORD_BYTES = 1 << 29  # seven hours of a gyro at 1 kHz
-_BINARY = 0  # format of records; 1 = protobuf
 
 
 class _Record(IntEnum):
@@ -58,7 +57,6 @@ _FIX = np.dtype(
     ]
 )
 _RAW_ZERO, _RAW_FULL = 32768, 32768  # raw value of zero; difference of the end of the range
-_RANGES_G = 8, 16, 32  # of accelerometers; if not stated, the one that gives about 1 g is taken
 STANDARD_GRAVITY = 9.80665
 _MIN_RATE_HZ, _MAX_RATE_HZ = 10.0, 20_000.0  # of gyro readings
 _MAX_TICK = 1 << 53  # of the camera's clock: exact as float64
@@ -210,9 +208,8 @@ def _find_records(
         first = at - _FOOTER.size - size
         if first < start or form > 2:
             break
-        is_directory = (
-            (form, number) == (_BINARY, _Record.DIRECTORY) and size and not size % _ENTRY.size
-        )
+        binary = form == 0  # 1 = protobuf
+        is_directory = binary and number == _Record.DIRECTORY and size and not size % _ENTRY.size
         if is_directory and _read_listed(file, start, first, size, wanted, contents):
             return  # such files have gaps between records, which cannot be read backwards
         if number in wanted:
@@ -326,7 +323,8 @@ def _gyro(
             of_full = (forces.astype(np.float64) - _RAW_ZERO) / _RAW_FULL
             if stated_g is None and len(of_full):
                 length = float(np.median(np.linalg.norm(of_full, axis=1)))
-                stated_g = float(min(_RANGES_G, key=lambda g: abs(np.log(max(g * length, 1e-9)))))
+                # the range of accelerometers that gives about 1 g
+                stated_g = float(min((8, 16, 32), key=lambda g: abs(np.log(max(g * length, 1e-9)))))
             full_rate = np.deg2rad(stated_deg_s or 2000.0)
             forces = of_full * (stated_g or 1.0)
             turns = (turns.astype(np.float64) - _RAW_ZERO) / _RAW_FULL * full_rate
