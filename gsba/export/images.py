@@ -7,7 +7,6 @@ import os
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 
@@ -104,7 +103,8 @@ class _CubeFaces(FrameWriter):
 
         f, frames, size = shown.f, shown.frames, self.size
         rig = CubeRig(size, np.pi / 2)
-        originals: Sequence[Path] = ()
+        as_it_is = not shown.kind.panoramic and size == shown.kind.width
+        originals = frames.paths[f] if as_it_is else ()
 
         def cut() -> Iterable[np.ndarray]:
             if shown.kind.panoramic:
@@ -121,8 +121,6 @@ class _CubeFaces(FrameWriter):
                 return np.ones((len(chosen), size, size), bool)
             return cubemap.cut_mask(shown.mask, rig)[chosen]
 
-        if not shown.kind.panoramic and size == shown.kind.width:
-            originals = frames.paths[f]
         self.write(shown, size, cut, cut_mask, originals=originals, link=self.link)
 
 

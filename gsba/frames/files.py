@@ -133,16 +133,16 @@ def decode(
         raise GsbaError(
             f"{path}: is {header.width}x{header.height}, was {size[0]}x{size[1]} when the run began"
         )
-    if header.crop is not None:
-        if header.kind == "JPEG":
-            return _padded(_decoded_jpeg(encoded, path, (0, 0), 1, gray, None), header.crop)
-        return _padded(_decoded(encoded, path, gray), header.crop)
-    if header.kind == "JPEG":
+    if header.kind != "JPEG":
+        pixels = _decoded(encoded, path, gray)
+    elif header.crop is not None:
+        pixels = _decoded_jpeg(encoded, path, (0, 0), 1, gray, None)
+    else:
         part = max(k for k in (1, 2, 4, 8) if k == 1 or size[0] >= k * (at_least or size[0]))
         stored = (size[1], size[0]) if header.swapped else size
         pixels = _decoded_jpeg(encoded, path, stored, part, gray, room)
-    else:
-        pixels = _decoded(encoded, path, gray)
+    if header.crop is not None:
+        return _padded(pixels, header.crop)
     upright = header.kind == "TIFF"  # OpenCV turns TIFFs by their tag in any case
     return pixels if upright else turned(pixels, header.orientation)
 
