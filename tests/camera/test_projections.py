@@ -11,9 +11,8 @@ from gsba.camera.projections import (
     projection_of_model,
 )
 
-LENSES: dict[
-    str, tuple[RadialProjection, float]
-] = {  # with the largest angle from the axis, degrees
+# with the largest angle from the axis, degrees
+LENSES: dict[str, tuple[RadialProjection, float]] = {
     "equidistant": (FisheyeProjection(400, 380, 120.0, (201.0, 188.0)), 110),
     "fisheye": (
         FisheyeProjection(400, 380, 120.0, (201.0, 188.0), (-0.03, 0.004, -0.0006, 0.00004)),
@@ -23,7 +22,6 @@ LENSES: dict[
     "pinhole": (PerspectiveProjection(640, 480, 400.0, (322.0, 238.0)), 80),
 }
 OF_EACH = pytest.mark.parametrize(("lens", "furthest"), LENSES.values(), ids=LENSES)
-STEP = np.array([0.02, 0.03, -0.01, 0.004, -0.002, 0.0005, -0.00004])
 
 
 def _directions(furthest_deg: float, least: float = 0.0, num: int = 300) -> np.ndarray:

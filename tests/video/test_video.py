@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from command import fails, run_gsba, succeed
 from refusals import refused
-from video_files import encode, steady, times_of
+from video_files import encode, interrupt, steady, times_of
 
 from gsba.config import VideoSettings
 from gsba.frames.scan import scan
 from gsba.log import GsbaError
 from gsba.trajectory.files import write_tum
 from gsba.types import Trajectory
-from gsba.video import extract, extraction
+from gsba.video import extract
 from gsba.video.colours import luma
 from gsba.video.likeness import apparent_motion_deg, miniature, sharpness
 
@@ -151,15 +151,7 @@ def test_an_interrupted_extraction_goes_on(
     settings = VideoSettings(fps=6, sharpest=True)
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     extract(film, whole, settings)
-    encode, calls = extraction._encoded, []
-
-    def fail_at_fifth(*arguments: object) -> bytes:
-        calls.append(arguments)
-        if len(calls) == 5:
-            raise KeyboardInterrupt
-        return encode(*arguments)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(extraction, "_encoded", fail_at_fifth)
+    calls = interrupt(monkeypatch, "_encoded", 5)
     with pytest.raises(KeyboardInterrupt):
         extract(film, parts, settings)
     assert len(list(parts.glob("*.jpg"))) == 4 and not (parts / "timestamps.csv").exists()
