@@ -5,6 +5,9 @@ from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
+import pytest
+
+from gsba.video import extraction
 
 TICK = Fraction(1, 90_000)  # seconds
 Track = tuple[Sequence[np.ndarray], Sequence[int]]  # RGB pictures, ticks at which they are shown
@@ -37,6 +40,20 @@ def encode(
             container.mux(stream.encode())
     path.write_bytes(path.read_bytes() + trailer)
     return path
+
+
+def interrupt(patch: pytest.MonkeyPatch, name: str, at: int) -> list[object]:
+    """Have a function of the extraction interrupted at a call; returns the calls to come."""
+    real, calls = getattr(extraction, name), []
+
+    def call(*arguments: object) -> object:
+        calls.append(arguments)
+        if len(calls) == at:
+            raise KeyboardInterrupt
+        return real(*arguments)
+
+    patch.setattr(extraction, name, call)
+    return calls
 
 
 def steady(num: int, ticks: int = 3000) -> list[int]:

@@ -24,7 +24,6 @@ from gsba.app.worker import ensure_worker
 from gsba.log import GsbaError
 from gsba.view.server import allowed
 
-_MAX_BODY, _MAX_LOG = 256 * 1024, 64 * 1024  # bytes
 _UPLOAD = "/upload"
 _TYPES = {".html": "text/html", ".css": "text/css", ".js": "text/javascript"}
 PAGE = {one.name: one for one in (files("gsba.app") / "page").iterdir() if one.name[0] != "."}
@@ -120,7 +119,7 @@ def _answering(app: App, handler: Handler) -> Callable[[Request], Awaitable[Resp
             body = b""
             async for chunk in request.stream():
                 body += chunk
-                if len(body) > _MAX_BODY:
+                if len(body) > 256 * 1024:
                     return JSONResponse({"error": "the request is too long"}, 413)
             try:
                 request.state.body = json.loads(body or b"{}")
@@ -252,21 +251,20 @@ def _job_map(app: App, request: Request) -> Any:
 
 def _job_log(app: App, request: Request) -> Response:
     job = app.jobs.get(request.path_params["id"])
-    content = job.log.read_bytes()[-_MAX_LOG:] if job.log.is_file() else b""
+    content = job.log.read_bytes()[-64 * 1024 :] if job.log.is_file() else b""
     return PlainTextResponse(content.decode("utf-8", "replace"))
 
 
 def _command(app: App, request: Request) -> Any:
     """The command line of a form's values, and why it would be refused, if it would."""
+    command = ""
     try:
         arguments = _arguments(app, request.state.body)
-    except GsbaError as error:
-        return {"command": "", "error": str(error)}
-    try:
+        command = _line(arguments)
         app.check(arguments)
     except GsbaError as error:
-        return {"command": _line(arguments), "error": str(error)}
-    return {"command": _line(arguments), "error": ""}
+        return {"command": command, "error": str(error)}
+    return {"command": command, "error": ""}
 
 
 def _add(app: App, request: Request) -> Any:

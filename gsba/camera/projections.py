@@ -5,7 +5,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib.metadata import entry_points
-from typing import ClassVar, Protocol, Self
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -15,44 +15,10 @@ _NUM_NEWTON_STEPS = 8  # enough for angles to converge in double precision
 _MIN_SLOPE = 0.1  # of the radius by the angle, in Newton's steps beyond a polynomial's own range
 
 
-class Projection(Protocol):
-    """Map of one lens from directions in its frame to pixels (u, v), from the picture's corner."""
-
-    @property
-    def width(self) -> int:
-        """Pixels of the picture."""
-        ...
-
-    @property
-    def height(self) -> int:
-        """Pixels of the picture."""
-        ...
-
-    @property
-    def num_parameters(self) -> int:
-        """K, parameters that can be estimated, in the order of `jacobians` and `stepped`."""
-        ...
-
-    def project(self, directions: np.ndarray) -> np.ndarray:
-        """Pixels (..., 2) of vectors (..., 3) of any length; NaN where the lens cannot see."""
-        ...
-
-    def unproject(self, pixels: np.ndarray) -> np.ndarray:
-        """Unit directions (..., 3) of pixels (..., 2)."""
-        ...
-
-    def jacobians(self, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Jacobians (N, 2, 3) of pixels by vectors (N, 3), and (N, 2, K) by the parameters."""
-        ...
-
-    def stepped(self, step: np.ndarray) -> Self:
-        """The projection after a step (K,) of its parameters."""
-        ...
-
-
 @dataclass(frozen=True, slots=True)
 class RadialProjection(ABC):
-    """A lens that is symmetric about its axis: r pixels from the principal point at each angle.
+    """Map of one lens from directions in its frame to pixels (u, v), from the picture's corner,
+    symmetric about the axis: r pixels from the principal point at each angle.
 
     Its parameters are the relative focal length (a factor's logarithm), the principal point in
     units of the focal length, and the radial terms.
@@ -77,11 +43,11 @@ class RadialProjection(ABC):
 
     @property
     def num_parameters(self) -> int:
-        """See `Projection`."""
+        """K, parameters that can be estimated, in the order of `jacobians` and `stepped`."""
         return 3 + len(self.radial)
 
     def project(self, directions: np.ndarray) -> np.ndarray:
-        """See `Projection`."""
+        """Pixels (..., 2) of vectors (..., 3) of any length; NaN where the lens cannot see."""
         across = np.hypot(directions[..., 0], directions[..., 1])
         angles = np.arctan2(across, directions[..., 2])
         if self.max_angle < np.pi:
@@ -91,7 +57,7 @@ class RadialProjection(ABC):
         return np.asarray(self.principal) + radii[..., None] * away
 
     def unproject(self, pixels: np.ndarray) -> np.ndarray:
-        """See `Projection`."""
+        """Unit directions (..., 3) of pixels (..., 2)."""
         away = (pixels - np.asarray(self.principal)) / self.focal
         radii = np.hypot(away[..., 0], away[..., 1])
         angles, most = radii.copy(), self.max_angle
@@ -102,7 +68,7 @@ class RadialProjection(ABC):
         return np.concatenate([across, np.cos(angles)[..., None]], axis=-1)
 
     def jacobians(self, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """See `Projection`."""
+        """Jacobians (N, 2, 3) of pixels by vectors (N, 3), and (N, 2, K) by the parameters."""
         x, y, z = directions.T
         across, squares = np.hypot(x, y), np.sum(directions**2, axis=1)
         angles = np.arctan2(across, z)
@@ -123,7 +89,7 @@ class RadialProjection(ABC):
         return self.focal * out, self.focal * by_parameters
 
     def stepped(self, step: np.ndarray) -> Self:
-        """See `Projection`."""
+        """The projection after a step (K,) of its parameters."""
         x, y = np.asarray(self.principal) + self.focal * step[1:3]
         terms = np.asarray(self.radial) + step[3:]
         return replace(
@@ -171,8 +137,8 @@ class PerspectiveProjection(RadialProjection):
         return np.tan(angles)[:, None] ** np.arange(3, 3 + 2 * len(self.radial), 2)
 
     def unproject(self, pixels: np.ndarray) -> np.ndarray:
-        """See `Projection`; Newton's steps are taken in the tangent, which is nearly linear. Pixels
-        that no direction reaches get one anyway, never NaN."""
+        """See `RadialProjection`; Newton's steps are taken in the tangent, which is nearly linear.
+        Pixels that no direction reaches get one anyway, never NaN."""
         away = (pixels - np.asarray(self.principal)) / self.focal
         radii = np.hypot(away[..., 0], away[..., 1])
         tangents = radii.copy()

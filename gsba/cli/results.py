@@ -112,15 +112,11 @@ def export(
 def shutter_of(run: Path, exposure_ms: float | None = None) -> "Shutter":
     """Times of a picture's exposure: the readout that the run found, and the exposure as given."""
     from gsba.export import Shutter
+    from gsba.store.finished import reported
 
-    try:
-        camera = json.loads((run / "report.json").read_text(encoding="utf-8"))["camera"]
-        readout_ms = camera["readout"]["ms"]
-    except (OSError, ValueError, KeyError, TypeError):
-        readout_ms = None  # no report, or no readout in it
     if exposure_ms is not None and not 0 < exposure_ms < 1000:
         raise GsbaError(f"--exposure-ms {exposure_ms:g}: give the milliseconds that a row is lit")
-    given = (readout_ms, exposure_ms)
+    given = (reported(run, "camera", "readout", "ms"), exposure_ms)
     return Shutter(*(None if value is None else float(value) / 1e3 for value in given))
 
 

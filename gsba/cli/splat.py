@@ -93,11 +93,8 @@ def evaluate_splat(
     out = run / "splat-evaluation"
     others = {}
     for path in against:
-        name = (
-            path.stem
-            if path.stem not in ("refined", *others)
-            else f"{path.parent.name}-{path.stem}"
-        )
+        taken = path.stem in ("refined", *others)
+        name = f"{path.parent.name}-{path.stem}" if taken else path.stem
         if name in ("refined", *others):
             raise GsbaError(f"--against {path}: another file goes by {name}, too: rename one")
         others[name] = read_trajectory(path)

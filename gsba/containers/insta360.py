@@ -18,7 +18,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from gsba.containers.protobuf import read_message
-from gsba.log import GsbaError, brief
+from gsba.log import GsbaError
 
 _SIGNATURE = b"8db42d694ccc418790edff439fe026bf"
 _HEADER = struct.Struct("<32xII32s")  # size of the trailer with this header, version, signature
@@ -28,7 +28,6 @@ _VERSION = 3
 _MAX_RECORDS = 256
 _MAX_METADATA_BYTES = 8 << 20
 _MAX_RECORD_BYTES = 1 << 29  # seven hours of a gyro at 1 kHz
-_BINARY = 0  # format of records; 1 = protobuf
 
 
 class _Record(IntEnum):
@@ -58,7 +57,6 @@ _FIX = np.dtype(
     ]
 )
 _RAW_ZERO, _RAW_FULL = 32768, 32768  # raw value of zero; difference of the end of the range
-_RANGES_G = 8, 16, 32  # of accelerometers; if not stated, the one that gives about 1 g is taken
 STANDARD_GRAVITY = 9.80665
 _MIN_RATE_HZ, _MAX_RATE_HZ = 10.0, 20_000.0  # of gyro readings
 _MAX_TICK = 1 << 53  # of the camera's clock: exact as float64
@@ -75,11 +73,6 @@ class GyroRecord:
     times: np.ndarray  # (N,) float64, s on the clock of `Insta360Trailer`, strictly increasing
     rates: np.ndarray  # (N, 3) float64, rad/s
     accelerations: np.ndarray  # (N, 3) float64, m/s^2, about 9.8 long at rest
-
-    @property
-    def rate_hz(self) -> float:
-        """Readings per second, by the median step; NaN for a single reading."""
-        return 1 / float(np.median(np.diff(self.times))) if len(self.times) > 1 else float("nan")
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,30 +128,6 @@ class Insta360Trailer:
     def has_frame_clock(self) -> bool:
         """True if times count from the first frame."""
         return self.first_frame_s is not None
-
-    def summary(self) -> list[str]:
-        """Lines of text on camera, gyro, exposures, positions, calibration, and notes."""
-        lines = [f"camera: {self.model or 'Insta360'}, firmware {self.firmware or 'not stated'}"]
-        if self.gyro is None:
-            lines.append("gyro: none")
-        else:
-            since = "the first frame" if self.has_frame_clock else "the first reading"
-            lines.append(
-                f"gyro: {len(self.gyro.times):,} readings at {self.gyro.rate_hz:.0f} Hz, "
-                f"{self.gyro.times[0]:.3f} to {self.gyro.times[-1]:.3f} s from {since}"
-            )
-        for name, of_lens in (("front", self.exposures), ("back", self.back_exposures)):
-            if of_lens is not None:
-                low, high = 1e3 * of_lens.durations.min(), 1e3 * of_lens.durations.max()
-                lines.append(
-                    f"exposures: {len(of_lens.times):,} of the {name} lens, {low:.2f} to "
-                    f"{high:.2f} ms"
-                )
-        lines.append(f"GPS: {0 if self.gps is None else len(self.gps.unix_times):,} fixes")
-        if self.readout_s is not None:
-            lines.append(f"readout: {1e3 * self.readout_s:.2f} ms")
-        known = f"by the maker: {brief(self.lens_strings[0])}" if self.lens_strings else "none"
-        return [*lines, f"lens calibration: {known}", *self.notes]
 
 
 def read_trailer(path: Path, telemetry: bool = True) -> Insta360Trailer | None:
@@ -239,9 +208,8 @@ def _find_records(
         first = at - _FOOTER.size - size
         if first < start or form > 2:
             break
-        is_directory = (
-            (form, number) == (_BINARY, _Record.DIRECTORY) and size and not size % _ENTRY.size
-        )
+        binary = form == 0  # 1 = protobuf
+        is_directory = binary and number == _Record.DIRECTORY and size and not size % _ENTRY.size
         if is_directory and _read_listed(file, start, first, size, wanted, contents):
             return  # such files have gaps between records, which cannot be read backwards
         if number in wanted:
@@ -355,7 +323,8 @@ def _gyro(
             of_full = (forces.astype(np.float64) - _RAW_ZERO) / _RAW_FULL
             if stated_g is None and len(of_full):
                 length = float(np.median(np.linalg.norm(of_full, axis=1)))
-                stated_g = float(min(_RANGES_G, key=lambda g: abs(np.log(max(g * length, 1e-9)))))
+                # the range of accelerometers that gives about 1 g
+                stated_g = float(min((8, 16, 32), key=lambda g: abs(np.log(max(g * length, 1e-9)))))
             full_rate = np.deg2rad(stated_deg_s or 2000.0)
             forces = of_full * (stated_g or 1.0)
             turns = (turns.astype(np.float64) - _RAW_ZERO) / _RAW_FULL * full_rate

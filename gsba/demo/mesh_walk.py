@@ -1,7 +1,6 @@
 """Walk through a user's mesh, rendered by open3d's ray caster; the truth is in the mesh's world."""
 
 import logging
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -132,7 +131,8 @@ def make_mesh_walk(
         truth = _free_walk(scene, mesh, num_frames, seed)
     logger.info("%s: %d triangles, %d frames", mesh, len(scene.triangles), len(truth.timestamps))
     with walk_folder(out, truth, seed) as partial:
-        write_frames(partial, truth, _pictures(scene, truth, width), seed)
+        pictures = (scene.picture(world_T_rig, width) for world_T_rig in truth.world_T_rigs)
+        write_frames(partial, truth, pictures, seed)
     return DemoWalk(out / "images", out / "groundtruth.tum", out / "slam.tum", None)
 
 
@@ -157,10 +157,6 @@ def _free_walk(scene: MeshScene, path: Path, num_frames: int, seed: int) -> Traj
     return Trajectory(
         level.timestamps, pose(rotations, level.world_T_rigs[:, :3, 3] @ world_R_level.T)
     )
-
-
-def _pictures(scene: MeshScene, truth: Trajectory, width: int) -> Iterator[np.ndarray]:
-    return (scene.picture(world_T_rig, width) for world_T_rig in truth.world_T_rigs)
 
 
 def _rgb(texture: np.ndarray) -> np.ndarray:

@@ -313,7 +313,10 @@ def make_film(
 
     check_choices(path, heading, camera)
     check_walk(out, num_frames, width, seed)
-    av = _pyav()
+    try:
+        import av
+    except ImportError:
+        raise GsbaError("--video needs PyAV to write a video: pip install 'gsba[video]'") from None
     lenses = TwoLenses() if camera == "two-lens" else None
     whole = walk_poses(path, heading, max(num_frames, WHOLE_WALK), seed, FPS)
     truth = Trajectory(whole.timestamps[:num_frames], whole.world_T_rigs[:num_frames])
@@ -325,14 +328,6 @@ def make_film(
         _encode(av, partial / "walk.mp4", exposed(truth, pictures, seed), width)
         write_tum(partial / "groundtruth.tum", truth)
     return DemoFilm(out / "walk.mp4", out / "groundtruth.tum", lenses)
-
-
-def _pyav() -> Any:
-    try:
-        import av
-    except ImportError:
-        raise GsbaError("--video needs PyAV to write a video: pip install 'gsba[video]'") from None
-    return av
 
 
 def _encode(av: Any, path: Path, pictures: Iterator[np.ndarray], width: int) -> None:

@@ -30,11 +30,6 @@ class Statistic:
     low: float  # lower end of the interval that holds EXPECTED of the samples
     high: float  # its upper end
 
-    @property
-    def expected(self) -> bool:
-        """True if the value is within the interval."""
-        return self.low <= self.value <= self.high
-
 
 @dataclass(frozen=True, slots=True)
 class Claims:

@@ -16,7 +16,6 @@ from gsba.store.records import HEADER_ERRORS
 from gsba.trajectory.association import matched_in_time
 from gsba.types import Trajectory
 
-STEPS = (1, 4)  # frames from a frame to the neighbours into which its pixels are projected
 _SPACING_PX = 4  # pixels of a depth map between samples
 
 
@@ -36,7 +35,7 @@ def induced_errors(
     truth: Trajectory,
     depth_of: Callable[[int], np.ndarray],
     width: int,
-    steps: Sequence[int] = STEPS,
+    steps: Sequence[int] = (1, 4),
 ) -> InducedErrors:
     """Project sampled pixels of each frame into its neighbours, under true and estimated poses.
 

@@ -156,19 +156,17 @@ def area_under_recall(
 def format_table(
     rows: Mapping[str, TrajectoryErrors],
     extra: Mapping[str, Sequence[str]] | None = None,
-    length_unit: str = "units",
 ) -> str:
     """Text table with a line per trajectory, units under the column names.
 
     Args:
         rows: name -> errors.
         extra: further columns, header with unit -> cells of all rows.
-        length_unit: unit of the truth, "m" only if its scale is metric.
     """
     header = [
         ["", "poses", "ATE rmse", "median", "max", "rotation", "rel. rot.", "RPE"]
         + [f"AUC@{threshold:g}°" for threshold in AUC_THRESHOLDS_DEG],
-        ["", "", length_unit, length_unit, length_unit, "deg", "deg", length_unit]
+        ["", "", "units", "units", "units", "deg", "deg", "units"]
         + ["%"] * len(AUC_THRESHOLDS_DEG),
     ]
     lines = header + [

@@ -7,7 +7,6 @@ from gsba.geometry import extent_of, nearest_rotation, rotation_angle
 from gsba.similarity import NoSimilarityError, extents, is_mirrored, residuals_of, similarity
 from gsba.types import Trajectory, rows_across
 
-_MOST_POSES = 200  # of the estimate, on which clocks are tried
 _MIN_OVERLAP = 0.9  # of the estimate with the truth, by another clock
 _MIN_GAIN = 3.0  # by which another clock reduces errors
 _MAX_SHARE = 0.005  # of the truth's extent: largest error with another clock
@@ -53,7 +52,7 @@ def _clock_shift(estimate: Trajectory, truth: Trajectory) -> float:
     """Seconds by which the truth's clock is ahead; 0.0 = none fits clearly better than its own."""
     known = np.flatnonzero(np.isfinite(estimate.world_T_rigs).all(axis=(1, 2)))
     step = float(np.median(np.diff(estimate.timestamps[known])))
-    known = known[rows_across(len(known), _MOST_POSES)]
+    known = known[rows_across(len(known), 200)]  # enough to try clocks on
     times, positions = estimate.timestamps[known], estimate.world_T_rigs[known, :3, 3]
     limit, found = _MAX_SHARE * extent_of(truth.world_T_rigs[:, :3, 3]), 0.0
     first, last = truth.timestamps[[0, -1]]

@@ -23,9 +23,9 @@ from gsba.camera.one_centre import seen_from_the_middle
 from gsba.camera.views import View, seen_from_lenses, shown_in_pictures
 from gsba.export.dataset import Dataset, ExportFormat
 from gsba.export.depths import write_depths
-from gsba.export.images import has_masks, panorama_writer, view_writer, views_of_cameras
+from gsba.export.images import has_masks, panorama_writers, view_writers, views_of_cameras
 from gsba.export.names import base_names, padded_names
-from gsba.export.pictures import Files, FrameWriter, by_camera
+from gsba.export.pictures import Files, FrameWriter
 from gsba.export.ply import write_cloud
 from gsba.export.raw import RawPictures
 from gsba.export.sensors import RigSensor, pinholes, project_in_rigs, raw_sensors
@@ -38,7 +38,7 @@ _BY_VIEW, _FLAT = "{view}/{name}{suffix}", "{name}_{view}{suffix}"  # names of i
 _FLAT_MASK = "{name}_{view}.png"  # others keep the image's suffix before .png, as COLMAP does
 
 
-def write_colmap(data: Dataset) -> FrameWriter:
+def write_colmap(data: Dataset) -> list[FrameWriter]:
     """Write faces or raw fisheyes in the rig layout or the flat one, without images; returns their
     writer."""
     frames, cameras, folder = data.frames, data.cameras, data.folder
@@ -84,11 +84,11 @@ def write_colmap(data: Dataset) -> FrameWriter:
     if data.options.depths:
         write_depths(data, seen, files, views)
     if raw:
-        return by_camera([RawPictures(own, data.options.link) for own in files], frames)
-    return view_writer(data, files, views)
+        return [RawPictures(own, data.options.link) for own in files]
+    return view_writers(data, files, views)
 
 
-def write_colmap_erp(data: Dataset) -> FrameWriter:
+def write_colmap_erp(data: Dataset) -> list[FrameWriter]:
     """Write the equirectangular layout, without images; returns their writer. Raises GsbaError: the
     frames are cube faces."""
     frames, cameras = data.frames, data.cameras
@@ -103,7 +103,7 @@ def write_colmap_erp(data: Dataset) -> FrameWriter:
     seen = seen_from_the_middle(data.reconstruction) if cameras else data.reconstruction
     names = _names([files] * len(rigs), frames)
     write_model(data.folder / "sparse" / "0", seen, rigs, names, frames.cameras)
-    return panorama_writer(data, files)
+    return panorama_writers(data, files)
 
 
 def write_model(

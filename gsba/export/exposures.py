@@ -17,7 +17,6 @@ from gsba.disk import write_bytes, write_json
 logger = logging.getLogger(__name__)
 
 _DARKEST, _BRIGHTEST = 16, 245  # of 255: beyond, noise or clipping changes the brightness
-_EXIF_IFD, _EXPOSURE_TIME = 0x8769, 0x829A  # tags of EXIF
 _PER_SECOND = 100_000_000  # denominator of an exposure time
 
 
@@ -109,7 +108,7 @@ def _brightness(path: Path, pixels: np.ndarray) -> np.ndarray:
 
 def _insert_exposure(path: Path, exposure: float) -> bool:
     """Write an exposure in stops into a JPEG, if it has no EXIF; False = it is no JPEG."""
-    from PIL import Image
+    from PIL import ExifTags, Image
     from PIL.TiffImagePlugin import IFDRational
 
     content = path.read_bytes()
@@ -119,7 +118,8 @@ def _insert_exposure(path: Path, exposure: float) -> bool:
         return True
     exif = Image.Exif()
     parts = round(0.01 * 2**exposure * _PER_SECOND)
-    exif.get_ifd(_EXIF_IFD)[_EXPOSURE_TIME] = IFDRational(parts, _PER_SECOND)
+    tags = exif.get_ifd(ExifTags.IFD.Exif)
+    tags[ExifTags.Base.ExposureTime] = IFDRational(parts, _PER_SECOND)
     segment = exif.tobytes()
     header = b"\xff\xe1" + (len(segment) + 2).to_bytes(2, "big")
     write_bytes(path, content[:2] + header + segment + content[2:])

@@ -120,7 +120,7 @@ def export_all(
     read = fingerprint(path for path in files if path and path.exists())  # some formats read none
     key = __version__, reconstruction, frames, read, up, seen_by, options
     datasets: list[Path] = []
-    writers: list[FrameWriter] = []
+    writers: list[list[FrameWriter]] = []
     with ExitStack() as folders:
         for to, out in outs.items():
             folder = output_folder(out, to.value, exported, content_digest(to.value, *key))
@@ -143,7 +143,7 @@ def _write_dataset(
     placement: Placement,
     cameras: Cameras,
     options: ExportOptions,
-) -> list[FrameWriter]:
+) -> list[list[FrameWriter]]:
     """Write a dataset of an unplaced map with its placement; returns the writers of images."""
     from gsba.export import colmap, gltf, metashape, nerfstudio, opensfm, panoramas, photos, ply
 

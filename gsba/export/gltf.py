@@ -18,7 +18,7 @@ import numpy as np
 
 from gsba.disk import write_bytes
 from gsba.export.dataset import Dataset
-from gsba.export.images import panorama_writer
+from gsba.export.images import panorama_writers
 from gsba.export.pictures import Files, FrameWriter
 from gsba.geometry import CV_R_GL, extent_of, quaternion_from_rotation
 from gsba.types import FrameSet, Reconstruction
@@ -28,7 +28,7 @@ _FLOAT, _UBYTE, _POINTS = 5126, 5121, 0  # glTF's numbers of component types and
 _SCRIPT = "open_in_blender.py"
 
 
-def write_blender(data: Dataset) -> list[FrameWriter]:
+def write_blender(data: Dataset) -> list[list[FrameWriter]]:
     """Write scene.glb and the script that opens it in Blender; returns the writer of panoramas, if
     they are wanted as backgrounds of the cameras."""
     files, frames = Files(data.folder, ("",), "images/{name}{suffix}", ""), data.frames
@@ -39,7 +39,7 @@ def write_blender(data: Dataset) -> list[FrameWriter]:
     shutil.copyfile(Path(__file__).with_name(_SCRIPT), data.folder / _SCRIPT)
     if not panoramas:
         return []
-    return [panorama_writer(data, files)]
+    return [panorama_writers(data, files)]
 
 
 def write_gltf(

@@ -7,7 +7,6 @@ import os
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 
@@ -17,7 +16,7 @@ from gsba.camera.one_centre import Stitcher
 from gsba.camera.rig import CubeRig
 from gsba.camera.views import Scenes, View, ViewCutter, scenes_of, views_for
 from gsba.export.dataset import Dataset
-from gsba.export.pictures import Files, FrameWriter, Pictures, SharedPixels, by_camera
+from gsba.export.pictures import Files, FrameWriter, Pictures, SharedPixels
 from gsba.frames.pixels import load_faces
 from gsba.log import GsbaError
 from gsba.memory import give_back_freed_memory
@@ -72,25 +71,24 @@ def views_of_cameras(
     ]
 
 
-def view_writer(
+def view_writers(
     data: Dataset, files: Sequence[Files], views: Sequence[tuple[View, ...]]
-) -> FrameWriter:
-    """Writer of every view of a frame, and of its mask if the frames have masks.
+) -> list[FrameWriter]:
+    """Writers (C,) of every view of a camera's frames, and of masks if the frames have masks.
 
     Args:
         data: of panoramas, or of cube faces, of which missing ones are not written.
         files: (C,) files of the images of each camera's frames.
         views: (C,) of each camera, see `views_of_cameras`.
     """
-    writers, frames = list[FrameWriter](), data.frames
-    scenes = scenes_of(data.reconstruction)
-    given = zip(files, frames.formats, views, data.cameras.lenses, strict=True)
+    writers, scenes = list[FrameWriter](), scenes_of(data.reconstruction)
+    given = zip(files, data.frames.formats, views, data.cameras.lenses, strict=True)
     for own, kind, seen, lenses in given:
         if lenses and kind.panoramic:
             writers.append(_LensFaces(own, lenses, scenes, seen))
         else:
             writers.append(_CubeFaces(own, seen[0].width, data.options.link))
-    return by_camera(writers, frames)
+    return writers
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +103,8 @@ class _CubeFaces(FrameWriter):
 
         f, frames, size = shown.f, shown.frames, self.size
         rig = CubeRig(size, np.pi / 2)
-        originals: Sequence[Path] = ()
+        as_it_is = not shown.kind.panoramic and size == shown.kind.width
+        originals = frames.paths[f] if as_it_is else ()
 
         def cut() -> Iterable[np.ndarray]:
             if shown.kind.panoramic:
@@ -122,8 +121,6 @@ class _CubeFaces(FrameWriter):
                 return np.ones((len(chosen), size, size), bool)
             return cubemap.cut_mask(shown.mask, rig)[chosen]
 
-        if not shown.kind.panoramic and size == shown.kind.width:
-            originals = frames.paths[f]
         self.write(shown, size, cut, cut_mask, originals=originals, link=self.link)
 
 
@@ -157,38 +154,38 @@ class _LensFaces(_OfLenses):
 
 
 def write_pictures(
-    frames: FrameSet, writers: Sequence[FrameWriter], workers: Workers | None = None
+    frames: FrameSet, datasets: Sequence[Sequence[FrameWriter]], workers: Workers | None = None
 ) -> None:
     """Write the images of all datasets of an export, frame by frame.
 
     Args:
-        writers: writers of the datasets, whose folders exist.
+        datasets: writers (C,) of each dataset, whose folder exists, by camera.
         workers: workers that share the disk; None = threads of this process.
     """
-    if not writers:
+    if not datasets:
         return
-    for writer in writers:
-        writer.make_folders(frames)
+    files = [writer.files for writers in datasets for writer in writers]
+    for of_camera in files:
+        of_camera.make_folders(frames)
     # An 8K panorama, a face and encoded images take 130 MB.
     workers = (workers or Threads(os.cpu_count() or 1)).at_most(4)
-    workers.must_see([writer.files.folder for writer in writers])
+    workers.must_see([of_camera.folder for of_camera in files])
     give_back_freed_memory(0)
-    for _ in workers.map_shards(Pictures(frames, writers)):
+    for _ in workers.map_shards(Pictures(frames, datasets)):
         pass
 
 
-def panorama_writer(data: Dataset, files: Files) -> FrameWriter:
-    """Writer that copies the panorama of a frame, and writes its mask if the frames have masks.
+def panorama_writers(data: Dataset, files: Files) -> list[FrameWriter]:
+    """Writers (C,) that copy the panoramas of each camera, and write masks if there are any.
 
     Panoramas that are corrected, those of raw pairs and of cube maps, and images that trainers
     misread are encoded again. Those of two lenses are stitched by `gsba.camera.one_centre`.
     """
     scenes = scenes_of(data.reconstruction)
-    writers = [
+    return [
         _Stitched(files, lenses, scenes) if lenses else _Panoramas(files, data.options.link)
         for lenses in data.cameras.lenses
     ]
-    return by_camera(writers, data.frames)
 
 
 @dataclass(frozen=True, slots=True)

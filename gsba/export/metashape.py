@@ -13,7 +13,7 @@ import numpy as np
 
 from gsba.camera.views import View, seen_from_lenses
 from gsba.export.dataset import Dataset
-from gsba.export.images import has_masks, panorama_writer, view_writer, views_of_cameras
+from gsba.export.images import has_masks, panorama_writers, view_writers, views_of_cameras
 from gsba.export.names import base_names
 from gsba.export.pictures import Files, FrameWriter
 from gsba.export.ply import write_cloud
@@ -21,7 +21,7 @@ from gsba.export.ply import write_cloud
 _Image = tuple[str, np.ndarray, int]  # path, world_T_camera (4, 4), number of the sensor
 
 
-def write_metashape(data: Dataset) -> FrameWriter:
+def write_metashape(data: Dataset) -> list[FrameWriter]:
     """Write cloud and cameras.xml of panoramas or of pinhole faces, without images; returns their
     writer."""
     frames, cameras, faces = data.frames, data.cameras, data.images != "panorama"
@@ -40,7 +40,7 @@ def write_metashape(data: Dataset) -> FrameWriter:
         ]
         paths = [files.images(frames, f)[0] for f in range(len(frames))]
         _write(data, sensors, list(zip(paths, poses, frames.cameras.tolist(), strict=True)))
-        return panorama_writer(data, files)
+        return panorama_writers(data, files)
     views = views_of_cameras(frames, data.options.face_size, cameras)
     of_cameras = [files_of([view.name for view in own]) for own in views]
     sensors, kinds = list[ET.Element](), list[list[int]]()
@@ -55,7 +55,7 @@ def write_metashape(data: Dataset) -> FrameWriter:
         paths = of_cameras[camera].images(frames, f)
         images += zip(paths, poses, kinds[camera], strict=True)
     _write(data, sensors, images)
-    return view_writer(data, of_cameras, views)
+    return view_writers(data, of_cameras, views)
 
 
 def _pinhole(number: int, view: View) -> ET.Element:

@@ -25,9 +25,9 @@ from gsba.camera.views import View, seen_from_lenses
 from gsba.export import motion
 from gsba.export.dataset import Dataset
 from gsba.export.depths import map_path, write_depths
-from gsba.export.images import has_masks, panorama_writer, view_writer, views_of_cameras
+from gsba.export.images import has_masks, panorama_writers, view_writers, views_of_cameras
 from gsba.export.names import base_names, padded_names
-from gsba.export.pictures import Files, FrameWriter, by_camera
+from gsba.export.pictures import Files, FrameWriter
 from gsba.export.ply import write_splat_points
 from gsba.export.raw import RawPictures, raw_lenses
 from gsba.export.split import held_out_frames
@@ -38,7 +38,7 @@ NERFSTUDIO_R_WORLD = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 _CLOUD = "points3D.ply"
 
 
-def write_nerfstudio(data: Dataset) -> list[FrameWriter]:
+def write_nerfstudio(data: Dataset) -> list[list[FrameWriter]]:
     """Write cloud and transforms.json of raw fisheyes, of panoramas, or of faces and beside these
     transforms_erp.json of panoramas, without images; returns their writers."""
     out_R_world = z_up_R_world(data.placement.up)
@@ -54,7 +54,7 @@ def write_nerfstudio(data: Dataset) -> list[FrameWriter]:
     return writers
 
 
-def _write_raw(data: Dataset, out_R_world: np.ndarray) -> FrameWriter:
+def _write_raw(data: Dataset, out_R_world: np.ndarray) -> list[FrameWriter]:
     frames, cameras, shutter = data.frames, data.cameras, data.options.shutter
     rigs = [raw_lenses(kind) for kind in frames.formats]
     moving = [  # (C,) True where the motion during the readout is known
@@ -90,7 +90,7 @@ def _write_raw(data: Dataset, out_R_world: np.ndarray) -> FrameWriter:
     if velocities is not None:
         camera |= motion.shutter_keys(shutter, rolling=any(moving))
     _write_transforms(data, "transforms.json", camera, entries, out_R_world)
-    return by_camera([RawPictures(one, data.options.link) for one in files], frames)
+    return [RawPictures(one, data.options.link) for one in files]
 
 
 def z_up_R_world(up: str | None) -> np.ndarray:
@@ -103,7 +103,7 @@ def _posed(reconstruction: Reconstruction, frames: FrameSet) -> Iterator[tuple[n
     return zip(reconstruction.world_T_rigs, frames.cameras.tolist(), strict=True)
 
 
-def _write_faces(data: Dataset, out_R_world: np.ndarray) -> FrameWriter:
+def _write_faces(data: Dataset, out_R_world: np.ndarray) -> list[FrameWriter]:
     frames, cameras, options = data.frames, data.cameras, data.options
     views = views_of_cameras(frames, options.face_size, cameras)
     masked = has_masks(frames)
@@ -135,10 +135,10 @@ def _write_faces(data: Dataset, out_R_world: np.ndarray) -> FrameWriter:
                 entry |= motion.velocity_keys(velocities[f], view.rig_T_view)
             entries[-1].append(entry)
     _write_transforms(data, "transforms.json", camera, entries, out_R_world)
-    return view_writer(data, files, views)
+    return view_writers(data, files, views)
 
 
-def _write_panoramas(data: Dataset, out_R_world: np.ndarray, which: str) -> FrameWriter:
+def _write_panoramas(data: Dataset, out_R_world: np.ndarray, which: str) -> list[FrameWriter]:
     frames = data.frames
     mask = f"masks{which}/{{name}}.png" if has_masks(frames) else ""
     names, pattern = base_names(padded_names(frames.names)), f"images{which}/{{name}}{{suffix}}"
@@ -160,7 +160,7 @@ def _write_panoramas(data: Dataset, out_R_world: np.ndarray, which: str) -> Fram
             entry["mask_path"] = hidden[0]
         entries.append([entry])
     _write_transforms(data, f"transforms{which}.json", camera, entries, out_R_world)
-    return panorama_writer(data, files)
+    return panorama_writers(data, files)
 
 
 def _files(data: Dataset, views: Sequence[str], masked: bool) -> Files:

@@ -17,7 +17,7 @@ import numpy as np
 from gsba.camera.one_centre import seen_from_the_middle
 from gsba.camera.sphere import erp_from_bearings
 from gsba.export.dataset import Dataset
-from gsba.export.images import has_masks, panorama_writer
+from gsba.export.images import has_masks, panorama_writers
 from gsba.export.names import base_names
 from gsba.export.pictures import Files, FrameWriter
 from gsba.geometry import inverse
@@ -25,7 +25,7 @@ from gsba.log import GsbaError
 from gsba.types import FrameSet, Reconstruction
 
 
-def write_opensfm(data: Dataset) -> FrameWriter:
+def write_opensfm(data: Dataset) -> list[FrameWriter]:
     """Write a project, in a world whose z points up, without images; returns their writer. Raises
     GsbaError: the frames are cube faces, or two of them get one file name."""
     from scipy.spatial.transform import Rotation
@@ -76,7 +76,7 @@ def write_opensfm(data: Dataset) -> FrameWriter:
     with (partial / "tracks.csv").open("w", encoding="utf-8") as file:
         file.write("OPENSFM_TRACKS_VERSION_v2\n")
         file.writelines(_tracks(seen, frames, shots))
-    return panorama_writer(data, files)
+    return panorama_writers(data, files)
 
 
 def _camera_name(width: int, height: int) -> str:

@@ -3,13 +3,13 @@ OUT/images OUT/trajectory.tum` reads them back."""
 
 from gsba.disk import write_csv
 from gsba.export.dataset import Dataset
-from gsba.export.images import has_masks, panorama_writer
+from gsba.export.images import has_masks, panorama_writers
 from gsba.export.pictures import Files, FrameWriter
 from gsba.trajectory.files import write_tum
 from gsba.types import Trajectory
 
 
-def write_poses(data: Dataset) -> list[FrameWriter]:
+def write_poses(data: Dataset) -> list[list[FrameWriter]]:
     """Write `trajectory.tum` and, if panoramas are wanted, `images/timestamps.csv`, one for each
     recording; returns the writer of images and masks."""
     frames = data.frames
@@ -24,4 +24,4 @@ def write_poses(data: Dataset) -> list[FrameWriter]:
         write_csv(path, ["name", "timestamp"], table)
     mask = "masks/{name}.png" if has_masks(frames) else ""
     files = Files(data.folder, ("",), "images/{name}{suffix}", mask, data.options.masks)
-    return [panorama_writer(data, files)]
+    return [panorama_writers(data, files)]

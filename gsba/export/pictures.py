@@ -8,7 +8,7 @@ import threading
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path, PurePosixPath
 from types import NoneType
@@ -25,7 +25,7 @@ from gsba.frames.masks import load_mask
 from gsba.frames.pixels import Buffers, load_padded, pictures_of
 from gsba.log import GsbaError
 from gsba.store.shards import even_blocks
-from gsba.types import FrameSet
+from gsba.types import FrameSet, cameras_of
 
 _EXPORTED_SUFFIX = {".insp": ".jpg", ".webp": ".jpg", ".tif": ".png", ".tiff": ".png"}
 
@@ -99,10 +99,6 @@ class FrameWriter:
         """Writer of frames `rows` (F',), renumbered; it can be pickled."""
         return self
 
-    def make_folders(self, frames: FrameSet) -> None:
-        """Make the folders of all images and masks."""
-        self.files.make_folders(frames)
-
     def images(self, shown: "SharedPixels") -> list[Path]:
         """Files of the frame's images."""
         return [self.files.folder / name for name in self.files.images(shown.frames, shown.f)]
@@ -152,41 +148,9 @@ class FrameWriter:
         return all(path.exists() for path in (*self.images(shown), *self.masks(shown)))
 
 
-@dataclass(frozen=True, slots=True)
-class _ByCamera(FrameWriter):
-    """Writes each frame as a writer for its camera does; `files` are those of the first one."""
-
-    writers: tuple[FrameWriter, ...]  # (C,)
-    of_frame: tuple[int, ...]  # (F,) index of the camera that took each frame
-
-    def __call__(self, shown: "SharedPixels") -> None:
-        self.writers[self.of_frame[shown.f]](shown)
-
-    def taken(self, rows: np.ndarray) -> FrameWriter:
-        # Every writer keeps its number: only those of frames that are taken are called.
-        writers = tuple(writer.taken(rows) for writer in self.writers)
-        return replace(self, writers=writers, of_frame=tuple(self.of_frame[f] for f in rows))
-
-    def make_folders(self, frames: FrameSet) -> None:
-        for writer in self.writers:
-            writer.make_folders(frames)
-
-    def images(self, shown: "SharedPixels") -> list[Path]:
-        return self.writers[self.of_frame[shown.f]].images(shown)
-
-    def masks(self, shown: "SharedPixels") -> list[Path]:
-        return self.writers[self.of_frame[shown.f]].masks(shown)
-
-
-def by_camera(writers: Sequence[FrameWriter], frames: FrameSet) -> FrameWriter:
-    """Writer of frames of several cameras; writers: (C,) of each camera's frames."""
-    if len(writers) == 1:
-        return writers[0]
-    return _ByCamera(writers[0].files, tuple(writers), frames.camera_of_frame)
-
-
 class Pictures:
-    """Job that writes the images of each frame for several datasets.
+    """Job that writes the images of each frame for several datasets, each with a writer for each
+    camera's frames (C,).
 
     A thread holds one panorama, and reuses its memory for the next frame.
     """
@@ -194,22 +158,24 @@ class Pictures:
     title = "writing images"
     returns: Any = NoneType
 
-    def __init__(self, frames: FrameSet, writers: Sequence[FrameWriter]) -> None:
-        self.frames, self._writers = frames, writers
+    def __init__(self, frames: FrameSet, datasets: Sequence[Sequence[FrameWriter]]) -> None:
+        self.frames, self._datasets = frames, datasets
+        self._cameras = frames.cameras.tolist()
         self.buffers = Buffers()
         self._uses = Counter(frames.mask_paths)
         self._masks: dict[Hashable, list[bytes]] = {}
         self._lock = threading.Lock()
 
     def __reduce__(self) -> tuple[object, ...]:  # buffers and masks are not pickled
-        return Pictures, (self.frames, self._writers)
+        return Pictures, (self.frames, self._datasets)
 
     def __len__(self) -> int:
         return len(self.frames)
 
     def __call__(self, item: int) -> None:
         shown = SharedPixels(self, item)
-        for writer in self._writers:
+        for writers in self._datasets:
+            writer = writers[self._cameras[item]]
             if not writer.wrote(shown):
                 writer(shown)
 
@@ -218,8 +184,9 @@ class Pictures:
 
     def part(self, start: int, stop: int) -> "Pictures":
         rows = np.arange(start, stop)
-        writers = [writer.taken(rows) for writer in self._writers]
-        return Pictures(self.frames.taken(rows, absolute=True), writers)
+        used, _ = cameras_of(self.frames.camera_of_frame, rows)
+        datasets = [[writers[c].taken(rows) for c in used] for writers in self._datasets]
+        return Pictures(self.frames.taken(rows, absolute=True), datasets)
 
     def masks(self, key: Hashable, make: Callable[[], list[bytes]]) -> list[bytes]:
         """Encoded masks under a key, made by the first frame that needs them."""

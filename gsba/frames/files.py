@@ -2,7 +2,7 @@
 
 import mmap
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from gsba.log import GsbaError
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".insp")  # the last: JPEG
 EXTRACTED = "extract.json"  # marker of a folder of extracted frames
+Found = dict[str, tuple[Path, ...]]  # frame -> picture of each lens, the front one first
 
 _MAX_PADDING_BYTES, _PADDING_VALUES = 1024, (b"\0", b"\xff")  # largest number of padding bytes
 # before the end, and their values
@@ -33,17 +34,37 @@ def entries_of(folder: Path) -> list[Path]:
         raise GsbaError(f"{folder}: cannot be read ({error.strerror})") from None
 
 
-def images_by_name(folder: Path, images: Iterable[Path]) -> dict[str, Path]:
-    """Images by frame name. Raises GsbaError: two of them have one name in `folder`, the folder of
-    all frames."""
+def images_in(folder: Path) -> list[Path]:
+    """Images in a folder, in name order; none if it is no folder."""
+    return list(filter(is_image, entries_of(folder))) if folder.is_dir() else []
+
+
+def images_by_name(
+    folder: Path, images: Iterable[Path], name_of: Callable[[str], str] = str
+) -> dict[str, Path]:
+    """Images by frame name, which is that of their stem. Raises GsbaError: two of them have one
+    name in `folder`, the folder of all frames."""
     found: dict[str, Path] = {}
     for path in images:
-        if path.stem in found:
+        one = found.setdefault(name_of(path.stem), path)
+        if one != path:
             raise GsbaError(
-                f"{folder}: '{found[path.stem].name}' and '{path.name}' are one frame's name twice"
+                f"{folder}: '{one.name}' and '{path.name}' are one frame's picture twice: keep one"
             )
-        found[path.stem] = path
     return found
+
+
+def paired(folder: Path, found: Sequence[Mapping[str, Path]], kinds: Sequence[str]) -> Found:
+    """Pictures of both lenses of each frame, of those of each one by frame name; kinds: what holds
+    a lens's pictures, for messages. Raises GsbaError: one has no counterpart."""
+    for ours, theirs, kind in ((*found, kinds[1]), (*found[::-1], kinds[0])):
+        missing = sorted(ours.keys() - theirs.keys())
+        if missing:
+            raise GsbaError(
+                f"{folder}: '{ours[missing[0]].relative_to(folder)}' has no picture in {kind} of "
+                f"the other lens ({len(missing)} of {len(ours)}); remove it, or extract both alike"
+            )
+    return {name: (path, found[1][name]) for name, path in found[0].items()}
 
 
 def is_image(path: Path) -> bool:
@@ -112,16 +133,16 @@ def decode(
         raise GsbaError(
             f"{path}: is {header.width}x{header.height}, was {size[0]}x{size[1]} when the run began"
         )
-    if header.crop is not None:
-        if header.kind == "JPEG":
-            return _padded(_decoded_jpeg(encoded, path, (0, 0), 1, gray, None), header.crop)
-        return _padded(_decoded(encoded, path, gray), header.crop)
-    if header.kind == "JPEG":
+    if header.kind != "JPEG":
+        pixels = _decoded(encoded, path, gray)
+    elif header.crop is not None:
+        pixels = _decoded_jpeg(encoded, path, (0, 0), 1, gray, None)
+    else:
         part = max(k for k in (1, 2, 4, 8) if k == 1 or size[0] >= k * (at_least or size[0]))
         stored = (size[1], size[0]) if header.swapped else size
         pixels = _decoded_jpeg(encoded, path, stored, part, gray, room)
-    else:
-        pixels = _decoded(encoded, path, gray)
+    if header.crop is not None:
+        return _padded(pixels, header.crop)
     upright = header.kind == "TIFF"  # OpenCV turns TIFFs by their tag in any case
     return pixels if upright else turned(pixels, header.orientation)
 

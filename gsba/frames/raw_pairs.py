@@ -2,7 +2,7 @@
 
 import logging
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from gsba.camera.calibration import read_calibration, scaled_to_size
 from gsba.camera.fisheye import Rig
-from gsba.frames.files import decode, entries_of, image_size, is_image
+from gsba.frames.files import Found, decode, image_size, images_by_name, images_in, is_image, paired
 from gsba.frames.image_circles import CircleSearch, ImageCircle, find_circle
 from gsba.frames.lens_names import FUSION_NAMES, LENS_NAMES, LensNames
 from gsba.frames.lens_overlap import measure_overlap, scaled
@@ -27,7 +27,6 @@ _QUARTER_TURNS = [
     Rotation.from_euler("z", turn).as_matrix() for turn in np.deg2rad([0, 90, 180, 270])
 ]
 
-Found = dict[str, tuple[Path, ...]]  # frame -> picture of each lens, the front one first
 _NUMBERED = re.compile(r"lens(\d+)", re.IGNORECASE)  # folders of more than two lenses
 
 
@@ -40,12 +39,12 @@ def find_pairs(folder: Path) -> Found | None:
     entries = sorted(folder.iterdir())
     images = [path for path in entries if is_image(path) and path.is_file()]
     numbered = {int(m[1]): path for path in entries if (m := _NUMBERED.fullmatch(path.name))}
-    numbered = {lens: path for lens, path in numbered.items() if _images_in(path)}
+    numbered = {lens: path for lens, path in numbered.items() if images_in(path)}
     if len(numbered) > 2 and not images:
         return _of_numbered(folder, numbered)
     known = {*FACES, *(name for names, _ in _FOLDERS for name in names)}
     by_name = {path.name.lower(): path for path in entries if path.name.lower() in known}
-    holding = {name: found for name, path in by_name.items() if (found := _images_in(path))}
+    holding = {name: found for name, path in by_name.items() if (found := images_in(path))}
     for names, maker in _FOLDERS:
         here = holding.keys() & {*names, *FACES}
         if not here or not here <= set(names):
@@ -63,11 +62,11 @@ def find_pairs(folder: Path) -> Found | None:
                 f"{folder}: holds {one}/ but no pictures in {other}/: of raw pairs the other "
                 f"lens's are missing{cube}; extract them again"
             )
-        front, back = (_by_frame(folder, holding[name]) for name in names)
+        front, back = (images_by_name(folder, holding[name], _name_of) for name in names)
         shown = [f"{by_name[name].name if maker else name}/" for name in names]
         if maker:
             _log.info("%s: raw pairs of a %s, front lens in %s, back in %s", folder, maker, *shown)
-        return _paired(folder, (front, back), (shown[0], shown[1]))
+        return paired(folder, (front, back), (shown[0], shown[1]))
     for tags in LENS_NAMES:
         found = _tagged_pairs(folder, images, tags)
         if found is not None:
@@ -82,10 +81,12 @@ def _of_numbered(folder: Path, numbered: Mapping[int, Path]) -> Found:
         raise GsbaError(
             f"{folder}: holds pictures in {held}: lenses are numbered from lens0 on without a gap"
         )
-    found = [_by_frame(folder, _images_in(numbered[lens])) for lens in sorted(numbered)]
+    found = [
+        images_by_name(folder, images_in(numbered[lens]), _name_of) for lens in sorted(numbered)
+    ]
     for lens, other in enumerate(found[1:], 1):
         kinds = f"{numbered[0].name}/", f"{numbered[lens].name}/"
-        _paired(folder, (found[0], other), kinds)
+        paired(folder, (found[0], other), kinds)
     return {name: tuple(of_lens[name] for of_lens in found) for name in found[0]}
 
 
@@ -97,11 +98,11 @@ def _tagged_pairs(folder: Path, images: Sequence[Path], tags: LensNames) -> Foun
     width, height = image_size(next(iter(tagged)))
     if width == 2 * height:
         return None
-    of_lens: tuple[dict[str, Path], dict[str, Path]] = {}, {}
-    for path, (lens, name) in tagged.items():
-        if name in of_lens[lens]:
-            raise _duplicate_error(folder, of_lens[lens][name], path)
-        of_lens[lens][name] = path
+    names = {path.stem: name for path, (_, name) in tagged.items()}
+    of_lens = []
+    for lens in (0, 1):
+        own = (path for path in tagged if tagged[path][0] == lens)
+        of_lens.append(images_by_name(folder, own, names.__getitem__))
     stray = next((path for path in images if path not in tagged), None)
     if stray is not None and all(of_lens):
         raise GsbaError(
@@ -113,7 +114,7 @@ def _tagged_pairs(folder: Path, images: Sequence[Path], tags: LensNames) -> Foun
     if tags.maker:
         given = folder, tags.maker, *tags.shown
         _log.info("%s: raw pairs of a %s, %s of the front lens, %s of the back one", *given)
-    return _paired(folder, of_lens, (f"a file {tags.shown[0]}", f"a file {tags.shown[1]}"))
+    return paired(folder, of_lens, (f"a file {tags.shown[0]}", f"a file {tags.shown[1]}"))
 
 
 def decode_pair(
@@ -264,41 +265,10 @@ def _found_circles(
     return circles[0], circles[1]
 
 
-def _images_in(folder: Path) -> list[Path]:
-    """Images in a folder, in name order; none if it is no folder."""
-    return list(filter(is_image, entries_of(folder))) if folder.is_dir() else []
-
-
-def _by_frame(folder: Path, images: Iterable[Path]) -> dict[str, Path]:
-    """Pictures of one lens by frame name: their stems without the part that names the lens."""
-    found: dict[str, Path] = {}
-    for path in images:
-        tag = next((tag for tags in FUSION_NAMES if (tag := tags.read(path.stem))), None)
-        name = path.stem if tag is None else tag[1]
-        if name in found:
-            raise _duplicate_error(folder, found[name], path)
-        found[name] = path
-    return found
-
-
-def _duplicate_error(folder: Path, one: Path, other: Path) -> GsbaError:
-    return GsbaError(
-        f"{folder}: '{one.name}' and '{other.name}' are one lens's picture of one frame twice: "
-        "keep one"
-    )
-
-
-def _paired(
-    folder: Path, found: tuple[Mapping[str, Path], Mapping[str, Path]], kinds: tuple[str, str]
-) -> Found:
-    for one, other, kind in ((0, 1, kinds[1]), (1, 0, kinds[0])):
-        missing = sorted(found[one].keys() - found[other].keys())
-        if missing:
-            raise GsbaError(
-                f"{folder}: '{found[one][missing[0]].name}' has no picture in {kind} of the other "
-                f"lens ({len(missing)} of {len(found[one])}); remove it, or extract both alike"
-            )
-    return {name: (path, found[1][name]) for name, path in found[0].items()}
+def _name_of(stem: str) -> str:
+    """Frame name of one lens's picture: its stem without the part that names the lens."""
+    tags = (names.read(stem) for names in FUSION_NAMES)
+    return next((tag[1] for tag in tags if tag), stem)
 
 
 def _nominal_lens(size: tuple[int, int], circle: ImageCircle, rig_R_lens: np.ndarray) -> Fisheye:

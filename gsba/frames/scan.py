@@ -25,6 +25,7 @@ from gsba.frames.files import (
     image_header,
     image_size,
     images_by_name,
+    images_in,
     is_image,
 )
 from gsba.frames.headers import Header
@@ -41,7 +42,7 @@ from gsba.frames.side_by_side import (
     two_circles,
 )
 from gsba.frames.times import frame_times
-from gsba.frames.track_pairs import find_tracks, track_size
+from gsba.frames.track_pairs import check_tracks, find_tracks
 from gsba.log import GsbaError, track
 from gsba.types import FACES, FrameSet, PictureFormat
 from gsba.types.records import spread_rows
@@ -107,9 +108,11 @@ def scan(
         raise GsbaError(f"{folder}: {num}; at least {min_frames} are needed{more}")
     names, times, timed = _in_time_order(Path(folder), found, timestamps, fps, order_suffices)
     paths = tuple(found[name] for name in names)
-    tracks = track_size(Path(folder), paths) if layout == "eac" else None
-    width, height = tracks or _common_size(paths, layout)
+    width, height = _common_size(paths, layout)
     images, lens_size = [group[0] for group in paths], (width, height)
+    tracks = lens_size if layout == "eac" else None
+    if tracks:
+        check_tracks(Path(folder), paths, tracks)
     factory = find_factory_lenses(Path(folder), images) if calibration is None else None
     known = calibration, circles, factory
     if layout == "erp" and (raw := _pair_size(Path(folder), images, lens_size, *known)) is not None:
@@ -275,7 +278,7 @@ def _find_frames(folder: Path) -> tuple[str, tuple[str, ...], dict[str, tuple[Pa
     subfolders = {
         path.name.lower(): path
         for path in entries
-        if path.name.lower() in FACES and path.is_dir() and any(map(is_image, path.iterdir()))
+        if path.name.lower() in FACES and images_in(path)
     }
     if subfolders and images:
         raise GsbaError(
@@ -298,7 +301,7 @@ def _find_frames(folder: Path) -> tuple[str, tuple[str, ...], dict[str, tuple[Pa
         _log.warning("%s: left out %s: convert them to JPEG, PNG, WebP or TIFF", folder, foreign)
     if subfolders:
         by_face = {
-            face: images_by_name(folder, filter(is_image, entries_of(subfolders[face])))
+            face: images_by_name(folder, images_in(subfolders[face]))
             for face in FACES
             if face in subfolders
         }
@@ -324,7 +327,7 @@ def _find_frames(folder: Path) -> tuple[str, tuple[str, ...], dict[str, tuple[Pa
 def _in_subfolders(folder: Path) -> str:
     """Where pictures are in folders of a folder, and what to do about it; "" = there are none."""
     folders = [path for path in entries_of(folder) if path.is_dir() and path.name[0] != "."]
-    below = [path for path in folders if any(map(is_image, entries_of(path)))]
+    below = list(filter(images_in, folders))
     if len(below) < 2:
         return f"its pictures are in {below[0]}: give that folder" if below else ""
     names = ", ".join(path.name for path in below[:5]) + (", ..." if len(below) > 5 else "")
@@ -380,7 +383,7 @@ def _common_size(paths: Sequence[tuple[Path, ...]], layout: str) -> tuple[int, i
                 raise _no_panorama(path, header, _stacked(path, (w, h)))
             if layout == "cube" and (w != h or h == 0):
                 raise GsbaError(f"{path}: is {w}x{h}; a cube face is square")
-            if (w, h) != (width, height) and layout == "fisheye":
+            if (w, h) != (width, height) and layout in ("fisheye", "eac"):
                 raise GsbaError(
                     f"{path}: is {w}x{h}, but '{first.parent.name}/{first.name}' is "
                     f"{width}x{height}: both lenses' pictures are of one size; extract them again"

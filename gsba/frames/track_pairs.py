@@ -19,7 +19,14 @@ from gsba.camera.equiangular import (
     squares,
 )
 from gsba.camera.sphere import erp_bands, table
-from gsba.frames.files import decode, entries_of, image_size, images_by_name, is_image
+from gsba.frames.files import (
+    Found,
+    decode,
+    entries_of,
+    images_by_name,
+    images_in,
+    paired,
+)
 from gsba.log import GsbaError
 from gsba.types import FACES, FrameSet, rows_across
 
@@ -31,7 +38,7 @@ _MIN_CORRELATION = 0.5  # median correlation of grey values along edges shared b
 _MIN_CONTRAST = 4.0  # least standard deviation of grey levels along an edge that is used
 
 
-def find_tracks(folder: Path) -> dict[str, tuple[Path, ...]] | None:
+def find_tracks(folder: Path) -> Found | None:
     """Find the pictures of both tracks of each frame in folders `track0` and `track5`.
 
     Any two numbers do; the lower one is the track of the front lens.
@@ -45,7 +52,7 @@ def find_tracks(folder: Path) -> dict[str, tuple[Path, ...]] | None:
     found: dict[int, Path] = {}
     for path in entries_of(folder):
         match = _FOLDER.fullmatch(path.name)
-        if match and path.is_dir() and any(map(is_image, entries_of(path))):
+        if match and images_in(path):
             found[int(match[1])] = path
     if not found:
         return None
@@ -57,48 +64,32 @@ def find_tracks(folder: Path) -> dict[str, tuple[Path, ...]] | None:
             f"{folder}: holds {held}; of a .360 recording, extract both video tracks, as track0/ "
             "and track5/ (gsba extract does)"
         )
-    folders = [folder / name for name in names]
-    first, second = (images_by_name(one, filter(is_image, entries_of(one))) for one in folders)
-    for one, other, (ours, theirs) in ((first, second, names), (second, first, names[::-1])):
-        missing = sorted(one.keys() - other.keys())
-        if missing:
-            raise GsbaError(
-                f"{folder}: '{ours}/{one[missing[0]].name}' has no picture of that name in "
-                f"{theirs}/ ({len(missing)} of {len(one)}); remove it, or extract both alike"
-            )
-    return {name: (path, second[name]) for name, path in first.items()}
+    tracks = [images_by_name(one, images_in(one)) for one in (folder / name for name in names)]
+    return paired(folder, tracks, [f"{name}/" for name in names])
 
 
-def track_size(folder: Path, pairs: Sequence[tuple[Path, ...]]) -> tuple[int, int]:
-    """Width and height of the pictures of two tracks; checks all headers and the pixels of some
-    frames.
+def check_tracks(folder: Path, pairs: Sequence[tuple[Path, ...]], size: tuple[int, int]) -> None:
+    """Check the size of the pictures of two tracks, and the pixels of some frames.
 
     Args:
         pairs: paths of both pictures of each frame.
+        size: width and height of all pictures.
 
     Raises:
-        GsbaError: sizes differ, tracks of an equi-angular cube map cannot have them, or squares do
-            not continue one another across both tracks.
+        GsbaError: tracks of an equi-angular cube map cannot have this size, or squares do not
+            continue one another across both tracks.
     """
-    first = pairs[0][0]
-    width, height = image_size(first)
+    width, height = size
     if not is_equiangular(width, height):
         raise GsbaError(
-            f"{first}: is {width}x{height}, no track of a .360 recording, which is three squares "
-            "wide and up to a twelfth more (4096x1344, 2272x736)"
+            f"{pairs[0][0]}: is {width}x{height}, no track of a .360 recording, which is three "
+            "squares wide and up to a twelfth more (4096x1344, 2272x736)"
         )
-    for path in (path for pair in pairs for path in pair):
-        if (size := image_size(path)) != (width, height):
-            raise GsbaError(
-                f"{path}: is {size[0]}x{size[1]}, but '{first.parent.name}/{first.name}' is "
-                f"{width}x{height}: both tracks are of one size; extract them again"
-            )
     _log.info(
         "%s: GoPro's equi-angular cube map, two tracks of %dx%d, %d columns from both lenses",
         folder, width, height, overlap_of(width, height),
     )  # fmt: skip
     # Refuse tracks whose grey values on both sides of common edges are not correlated
-    size = (width, height)
     rows = rows_across(len(pairs), 5)
     found = [_edge_correlations(_decoded(pairs[row], size, gray=True)) for row in rows]
     known = np.concatenate(found)
@@ -108,7 +99,6 @@ def track_size(folder: Path, pairs: Sequence[tuple[Path, ...]]) -> tuple[int, in
             f"meet at their edges (correlation {np.median(known):.2f}): their pictures are not of "
             "the same instants, or not of GoPro's equi-angular layout; extract both tracks again"
         )
-    return width, height
 
 
 def load_squares(frames: FrameSet, f: int, gray: bool = False) -> np.ndarray:

@@ -9,7 +9,6 @@ from gsba.frames import cubemap
 from gsba.log import GsbaError
 from gsba.types import FrameSet, Reconstruction, rows_across
 
-_NUM_FRAMES = 3  # that are read
 _FACE_PX = 640
 _MIN_POINTS = 50  # of a frame, to be judged
 _MIN_CORRELATION = 0.35  # of brightness in frames and of the points there, the median: .61 and more
@@ -31,7 +30,7 @@ def refuse_changed_frames(run: Path, reconstruction: Reconstruction, frames: Fra
     rows = np.flatnonzero(observed >= _MIN_POINTS)
     if not len(rows):
         return
-    rows = rows[rows_across(len(rows), _NUM_FRAMES)].tolist()
+    rows = rows[rows_across(len(rows), 3)].tolist()
     found = [_correlation(reconstruction, frames, f) for f in rows]
     if np.median(found) < _MIN_CORRELATION:
         raise GsbaError(

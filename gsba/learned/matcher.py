@@ -27,7 +27,6 @@ from gsba.types import FACES, Features
 _UPRIGHT_FACES = [*product(range(4), range(4)), (4, 4), (5, 5)]
 # Half of the pairs of faces have nine tenths of the true matches (benchmarks/results/tours.md).
 _MIN_ALIKE_SHARE = 0.1  # of a face's mutual nearest neighbours
-_MAX_PAIRS_OF_FACES = 9  # of two frames, where nothing predicts the pose
 
 
 def make_matcher(settings: RefineSettings, weights: Mapping[str, Path], size: int) -> Matcher:
@@ -84,7 +83,7 @@ class FaceMatcher:
             compared = overlapping_faces(bearings0, bearings1, f0_T_f1)
         else:
             by_likeness = sorted(_UPRIGHT_FACES, key=alike.__getitem__, reverse=True)
-            compared = by_likeness[:_MAX_PAIRS_OF_FACES]
+            compared = by_likeness[:9]
         for faces in compared:
             if alike[faces] < _MIN_ALIKE_SHARE:
                 continue

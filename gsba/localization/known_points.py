@@ -10,7 +10,7 @@ from factors import Block, PoseSystem, RobustLoss, tangent_basis
 from gsba.bundle.adjustment import MIN_NOISE
 from gsba.bundle.optimizer import SolverOptions, marginal_covariances, optimize
 from gsba.bundle.pose_variables import X, values_of
-from gsba.camera.projections import Projection
+from gsba.camera.projections import RadialProjection
 from gsba.types.records import with_rows
 
 _BEHIND = 1e3  # whitened residual of a point that the picture cannot show
@@ -31,7 +31,7 @@ def isotropic(sigmas: np.ndarray) -> np.ndarray:
     return sigmas[:, None, None] ** 2 * np.eye(2)
 
 
-def _no_step(projection: Projection) -> np.ndarray:
+def _no_step(projection: RadialProjection) -> np.ndarray:
     return np.zeros(projection.num_parameters)
 
 
@@ -60,7 +60,7 @@ class Residuals:
 
 
 def residuals_of(
-    seen: PointSightings, world_T_rig: np.ndarray, projection: Projection | None
+    seen: PointSightings, world_T_rig: np.ndarray, projection: RadialProjection | None
 ) -> Residuals:
     """Residuals of sightings at a pose (4, 4): in a panorama on the bearing's tangent plane, in a
     photo in pixels."""
@@ -100,12 +100,12 @@ class KnownPointBlock(Block):
     def __init__(
         self,
         pictures: Sequence[PointSightings],
-        projections: Sequence[Projection],
+        projections: Sequence[RadialProjection],
         loss: RobustLoss,
     ) -> None:
         self._pictures, self._loss = tuple(pictures), loss
         # Cameras at accepted values, and these: steps lead on from there.
-        self._projections: list[Projection] = list(projections)
+        self._projections: list[RadialProjection] = list(projections)
         self._at = [_no_step(one) for one in projections]
         self._roots: list[np.ndarray] = []  # (N, 2, 2) inverse square root of each covariance
         self.keys: list[int] = [X(p) for p in range(len(pictures))]
@@ -160,11 +160,11 @@ class KnownPointBlock(Block):
         self.refresh(values)
         return self._squares(values)
 
-    def projections(self, values: gtsam.Values) -> list[Projection]:
+    def projections(self, values: gtsam.Values) -> list[RadialProjection]:
         """Projections (C) of the cameras."""
         return [self._projection(c, values) for c in range(len(self._projections))]
 
-    def _projection(self, camera: int, values: gtsam.Values) -> Projection:
+    def _projection(self, camera: int, values: gtsam.Values) -> RadialProjection:
         step = values.atVector(K(camera)) - self._at[camera]
         return self._projections[camera].stepped(step)
 
@@ -206,7 +206,7 @@ class PoseFit:
     covariances: np.ndarray  # (P, 6, 6), tangent [rotation rad, translation], NaN = not determined
     inliers: tuple[np.ndarray, ...]  # (P) of (N,) bool
     noises: np.ndarray  # (P,) of keypoints, in their own standard deviations
-    projections: tuple[Projection, ...]  # (C) of the cameras
+    projections: tuple[RadialProjection, ...]  # (C) of the cameras
     camera_covariances: np.ndarray  # (C, 6, 6), of the projection's parameters, zero beyond these
 
 
@@ -214,7 +214,7 @@ def fit(
     pictures: Sequence[PointSightings],
     starts: np.ndarray,
     scales: Sequence[float],
-    projections: Sequence[Projection] = (),
+    projections: Sequence[RadialProjection] = (),
     priors: Sequence[CameraPrior] = (),
 ) -> PoseFit:
     """Minimise the robust residuals of sightings over poses (P, 4, 4) and cameras (C) with priors,
@@ -263,7 +263,7 @@ def is_determined(
 def _block(
     pictures: Sequence[PointSightings],
     noises: np.ndarray,
-    projections: Sequence[Projection],
+    projections: Sequence[RadialProjection],
     scale: float,
     loss: str = "cauchy",
 ) -> KnownPointBlock:

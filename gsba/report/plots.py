@@ -1,8 +1,6 @@
 """Figures of several runs: trajectories, errors against the truth, residuals."""
 
-import json
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +13,7 @@ from gsba.log import GsbaError
 from gsba.report.html.figures import viewing_axes
 from gsba.report.report import angular_residuals, frame_quality
 from gsba.similarity import NoSimilarityError, Sim3, pose_similarity
-from gsba.store.finished import load_run
+from gsba.store.finished import load_run, reported
 from gsba.trajectory.association import matched_in_time, refuse_untimed
 from gsba.trajectory.files import read_trajectory
 from gsba.types import Trajectory, rows_across
@@ -62,16 +60,14 @@ def _read(name: str, path: Path, truth: Trajectory | None) -> PlottedRun:
     reconstruction, frames = load_run(path)
     if truth is not None:
         refuse_untimed(frames, truth)
-    coarse, start = path / "coarse.tum", ""
-    with suppress(OSError, ValueError, KeyError):  # of an older run
-        start = f" ({json.loads((path / 'report.json').read_text(encoding='utf-8'))['start']})"
+    coarse, start = path / "coarse.tum", reported(path, "start")
     return PlottedRun(
         name,
         Trajectory(frames.timestamps, reconstruction.world_T_rigs),
         read_trajectory(coarse) if coarse.is_file() else None,
         np.sort(np.degrees(angular_residuals(reconstruction))),
         frame_quality(reconstruction).median_residuals_deg,
-        before=f"before{start}",
+        before=f"before ({start})" if start else "before",
     )
 
 

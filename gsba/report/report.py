@@ -273,7 +273,7 @@ def plain(value: Any, digits: int = 17) -> Any:
         return value if digits >= 17 else float(f"{value:.{digits}g}")
     if kind in (int, str, bool, type(None)):  # JSON holds them as they are
         return value
-    if kind is list:
+    if isinstance(value, list | tuple):
         return [plain(item, digits) for item in value]
     if isinstance(value, BaseModel):
         return value.model_dump(mode="json")
@@ -286,8 +286,6 @@ def plain(value: Any, digits: int = 17) -> Any:
         return {str(key): plain(item, digits) for key, item in value.items()}
     if isinstance(value, np.ndarray | np.generic):
         return _plain_array(np.asarray(value), digits)
-    if isinstance(value, list | tuple):
-        return [plain(item, digits) for item in value]
     if isinstance(value, Enum):
         return value.value
     return str(value) if isinstance(value, Path) else value

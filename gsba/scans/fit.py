@@ -1,7 +1,6 @@
 """Point-to-plane alignment of a cloud to a scan: a similarity by a robust loss, with covariance."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -167,18 +166,10 @@ def scatter(fit: Sim3, cloud: Cloud, scan: Scan, width: float) -> float:
     return float(np.median(np.abs(off[near])) / MEDIAN_ABS_NORMAL) if near.sum() > 20 else width
 
 
-class _Weighted(NamedTuple):
-    """Weighted equations of a Gauss-Newton step."""
-
-    jacobians: np.ndarray  # (N, 7), of residuals by the step
-    off: np.ndarray  # (N,) residuals, unit of the scan
-    variances: np.ndarray  # (N,) of residuals
-    weights: np.ndarray  # (N,) of the robust loss, over variances
-    carried: np.ndarray  # (N, 3) transformed points of the cloud
-    middle: np.ndarray  # (3,) weighted mean of these
-
-
-def _weighted(fit: Sim3, cloud: Cloud, scan: Scan, noise: Noise) -> _Weighted:
+def _weighted(fit: Sim3, cloud: Cloud, scan: Scan, noise: Noise) -> tuple[np.ndarray, ...]:
+    """Equations of a Gauss-Newton step: Jacobians (N, 7) of residuals by the step, residuals (N,),
+    their variances, weights of the robust loss over variances, the cloud's transformed points (N,
+    3), and the weighted mean (3,) of these."""
     reach = 4 * noise.sigma
     carried, nearest, off, gaps = residuals_of(fit, cloud, scan, reach + scan.reach)
     normals = scan.normals[nearest]
@@ -189,7 +180,7 @@ def _weighted(fit: Sim3, cloud: Cloud, scan: Scan, noise: Noise) -> _Weighted:
     arms = carried - middle
     along = np.einsum("ni,ni->n", normals, arms)
     jacobians = np.column_stack([np.cross(arms, normals), normals, along])
-    return _Weighted(jacobians, off, variances, weights, carried, middle)
+    return jacobians, off, variances, weights, carried, middle
 
 
 def _step(fit: Sim3, cloud: Cloud, scan: Scan, noise: Noise) -> tuple[Sim3, float]:

@@ -157,15 +157,11 @@ class Distances:
         """90th percentile of the distances."""
         return float(np.quantile(self.values, 0.9))
 
-    def histogram(self, furthest: float) -> tuple[np.ndarray, np.ndarray]:
-        """Counts (B + 1,), the last one of distances beyond `furthest`, and edges (B + 1,)."""
-        edges = np.linspace(0, furthest, 31)
-        counts = np.histogram(self.values, edges)[0]
-        return np.append(counts, np.sum(self.values > furthest)), edges
-
     def to_json(self, furthest: float) -> dict[str, Any]:
-        """Plain values for JSON; the histogram spans distances up to `furthest`."""
-        counts, edges = self.histogram(furthest)
+        """Plain values for JSON; the histogram spans distances up to `furthest`, and its last count
+        is of those beyond."""
+        edges = np.linspace(0, furthest, 31)
+        counts = np.append(np.histogram(self.values, edges)[0], np.sum(self.values > furthest))
         return {
             "points": len(self.values),
             "median": self.median,

@@ -1,6 +1,8 @@
 """Reading of a finished run's result."""
 
+import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -27,6 +29,17 @@ def load_run(out: Path | str, map_number: int = 1) -> tuple[Reconstruction, Fram
     if not (np.isfinite(shown.timestamps).all() and (np.diff(shown.timestamps) > 0).all()):
         raise GsbaError(f"{out}: its timestamps do not increase: refine again with --fresh")
     return main, shown
+
+
+def reported(out: Path, *keys: str) -> Any:
+    """Value under nested keys of a run's report.json; None = it has none, or there is no report."""
+    try:
+        found = json.loads((out / "report.json").read_text(encoding="utf-8"))
+        for key in keys:
+            found = found[key]
+        return found
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
 
 
 def map_digest(main: Reconstruction, frames: FrameSet) -> str:

@@ -41,7 +41,6 @@ HEADER_ERRORS = (SyntaxError, tokenize.TokenError, RecursionError)  # of a damag
 _MANIFEST = "manifest.json"
 _ALIGNMENT = 64  # bytes, of arrays in a file: that of .npy headers
 _LOCAL_HEADER = 30  # bytes of a member before its name
-_ZIP64_FIELD = 20  # bytes of its sizes behind it
 _BYTES_AT_ONCE = 1 << 22  # that are checked, of an array that stays on the disk
 MIN_MAPPED_BYTES = 1 << 22  # of arrays that are worth a mapping
 _HEADER = re.compile(
@@ -85,7 +84,8 @@ def _write_array(member: IO[bytes], array: np.ndarray) -> None:
 def _aligned(name: str, archive: zipfile.ZipFile) -> zipfile.ZipInfo:
     """Next member of an archive that is being written, which begins at a multiple of 64 bytes."""
     assert archive.fp is not None
-    header = _LOCAL_HEADER + len(name.encode()) + _ZIP64_FIELD + 4  # of the padding itself
+    # The header ends with 20 bytes of sizes (ZIP64) and the padding's own 4.
+    header = _LOCAL_HEADER + len(name.encode()) + 20 + 4
     missing = -(archive.fp.tell() + header) % _ALIGNMENT
     member = zipfile.ZipInfo(name, date_time=time.localtime()[:6])
     # the extra field that zip files are aligned by

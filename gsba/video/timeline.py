@@ -6,11 +6,11 @@ pictures with a chosen frame are decoded.
 """
 
 import struct
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from fractions import Fraction
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
@@ -210,23 +210,15 @@ def read_timeline(track: Track) -> Timeline:
 def read_claims(track: Track) -> PictureClaims:
     """Claims of a track about its pictures; none if its first second cannot be decoded. GsbaError:
     the file is no video, or there is no decoder for it."""
-    av = _pyav()
     with _opened(track.path) as (container, streams):
         stream = streams[track.number]
-        for packet in islice(container.demux(stream), _MAX_CLAIM_PACKETS):
-            try:
-                pictures = packet.decode()
-            except av.error.InvalidDataError:
-                continue
-            if pictures:
-                return claims_of(pictures[0], stream.sample_aspect_ratio)
-    return PictureClaims()
+        picture = _first_picture(container, stream)
+        return claims_of(picture, stream.sample_aspect_ratio) if picture else PictureClaims()
 
 
 def decode(track: Track, timeline: Timeline, chosen: Sequence[int]) -> Iterator[tuple[int, Any]]:
     """Yield (index, av.VideoFrame) of chosen frames, ascending indices into `timeline.ticks`;
     damaged ones are left out."""
-    av = _pyav()
     wanted = {int(timeline.ticks[i]): i for i in chosen}
     begins = np.searchsorted(timeline.keyframes, timeline.ticks[list(chosen)], side="right") - 1
     stops = np.flatnonzero(np.diff(begins) > 1) + 1  # a whole group lies between: seek
@@ -238,11 +230,7 @@ def decode(track: Track, timeline: Timeline, chosen: Sequence[int]) -> Iterator[
                 continue
             last = int(timeline.ticks[chosen[part[-1]]])
             container.seek(int(timeline.seek_to[max(begins[part[0]], 0)]), stream=stream)
-            for packet in container.demux(stream):
-                try:
-                    pictures = packet.decode()
-                except av.error.InvalidDataError:
-                    continue  # damaged: its frame is missing
+            for pictures in _decoded(container.demux(stream)):
                 for frame in pictures:
                     if frame.pts in wanted and not frame.is_corrupt:
                         yield wanted.pop(frame.pts), frame
@@ -254,21 +242,29 @@ def picture_near(video: Path, share: float) -> np.ndarray:
     """Colours (H, W, 3) uint8 BGR of the last frame of a video's first track before a place, 0..1
     of its duration, at which decoding can begin, without reading the whole file. GsbaError: the
     file is no video, or nothing can be decoded."""
-    av = _pyav()
     with _opened(video) as (container, streams):
         stream, end = streams[0], _claimed_end(container, streams[0])
         if share and end:
             container.seek(
                 int((stream.start_time or 0) + share * end / stream.time_base), stream=stream
             )
-        for packet in islice(container.demux(stream), _MAX_CLAIM_PACKETS):
-            try:
-                pictures = packet.decode()
-            except av.error.InvalidDataError:
-                continue
-            for picture in pictures:
-                return turned(bgr(picture), claims_of(picture, None).orientation)
+        if picture := _first_picture(container, stream):
+            return turned(bgr(picture), claims_of(picture, None).orientation)
     raise GsbaError(f"{video}: no picture can be decoded: copy or export it again")
+
+
+def _first_picture(container: Any, stream: Any) -> Any:
+    """The next av.VideoFrame that can be decoded; None = none of the next packets' can."""
+    packets = islice(container.demux(stream), _MAX_CLAIM_PACKETS)
+    return next(chain.from_iterable(_decoded(packets)), None)
+
+
+def _decoded(packets: Iterable[Any]) -> Iterator[list[Any]]:
+    """Pictures of each packet; those of damaged ones are missing."""
+    damaged = _pyav().error.InvalidDataError
+    for packet in packets:
+        with suppress(damaged):
+            yield packet.decode()
 
 
 def _pyav() -> Any:

@@ -18,7 +18,7 @@ from gsba.log import GsbaError
 from gsba.placement.world import Placement, read_placement
 from gsba.report.html.figures import viewing_axes
 from gsba.splat.gaussians import SH_CONSTANT, Gaussians, read_ply
-from gsba.store.finished import load_cameras, load_run, map_digest
+from gsba.store.finished import load_cameras, load_run, map_digest, reported
 from gsba.store.folder import STAGES
 from gsba.trajectory.files import read_trajectory
 from gsba.types import FACES, FrameSet, Reconstruction, RunStart
@@ -89,7 +89,7 @@ def load_scene(run: Path) -> RunScene:
         grounds=grounds,
         step=float(np.median(moving)) if len(moving) else 1.0,
         optics=Optics.of(lenses, placed),
-        start=_start(run),
+        start=str(reported(run, "start") or RunStart.TRAJECTORY),
         judged=_judged(run, placed),
     )
 
@@ -98,14 +98,6 @@ def files_of_scene(run: Path) -> list[Path]:
     """The files of a run that its scene depends on."""
     patterns = f"{STAGES}/reconstruction.npz", "*/transform.json", _SPLATS, "scan.json"
     return sorted(path for pattern in patterns for path in run.glob(pattern))
-
-
-def _start(run: Path) -> str:
-    """Source of the poses at the start, by the run's report."""
-    try:
-        return str(json.loads((run / "report.json").read_text(encoding="utf-8"))["start"])
-    except (OSError, ValueError, KeyError, TypeError):  # a view needs no report
-        return RunStart.TRAJECTORY
 
 
 def _judged(run: Path, placed: Reconstruction) -> tuple[np.ndarray, np.ndarray] | None:

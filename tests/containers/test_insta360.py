@@ -41,7 +41,8 @@ def test_a_real_file_to_the_number() -> None:
     assert found.readout_s == pytest.approx(0.02227798)
     gyro = found.gyro
     assert gyro.rates.shape == gyro.accelerations.shape == (1178, 3)
-    assert gyro.rate_hz == pytest.approx(1000)
+    assert np.median(np.diff(gyro.times)) == pytest.approx(1e-3, rel=1e-6)
+    assert gyro.times[-1] == pytest.approx(1.040, abs=5e-4)
     # The first reading: u16 33475 32163 33163 32796 32618 33227 at 309334917 us.
     g = np.array([33475, 32163, 33163]) / 1024 - 32
     np.testing.assert_allclose(gyro.accelerations[0], 9.80665 * g)
@@ -55,10 +56,6 @@ def test_a_real_file_to_the_number() -> None:
     np.testing.assert_allclose(np.diff(found.exposures.times)[2:], 1 / 30, atol=2e-4)
     assert found.gps is None and found.back_exposures is None  # its two fixes were made anonymous
     assert found.notes == ("GPS: 2 of 2 fixes are damaged or at 0, 0",)
-    text = "\n".join(found.summary())
-    assert "Insta360 OneR, firmware v2.0.0_build11" in text
-    assert "1,178 readings at 1000 Hz, -0.135 to 1.040 s from the first frame" in text
-    assert "40 of the front lens, 33.20 to 33.24 ms" in text and "GPS: 0 fixes" in text
     readings = read_imu(made.REAL)
     np.testing.assert_array_equal(readings.rates, gyro.rates)
 
@@ -130,7 +127,8 @@ def test_a_layout_that_is_not_stated_or_wrongly_so_is_told_by_the_numbers(tmp_pa
             records = ((0, made.GYRO, record), (1, 1, made.message({2: "X", **said})))
             found = _read(tmp_path / "v.insv", made.trailer(records))
             assert found.gyro is not None and not found.notes
-            assert len(found.gyro.times) == 280 and found.gyro.rate_hz == pytest.approx(1000)
+            assert len(found.gyro.times) == 280
+            np.testing.assert_allclose(np.diff(found.gyro.times), 1e-3)
             np.testing.assert_allclose(found.gyro.rates, 0.25, atol=1e-3)
             np.testing.assert_allclose(found.gyro.accelerations[:, 2], 9.80665, rtol=1e-3)
             assert found.gyro.times[0] == 0 and not found.has_frame_clock
@@ -225,7 +223,7 @@ def _tolerated(path: Path, content: bytes) -> bool:
     except GsbaError as error:
         assert "\n" not in str(error) and str(path) in str(error)
         return False
-    assert found is None or all("\n" not in line for line in found.summary())
+    assert found is None or "\n" not in "".join(found.notes)
     return found is not None
 
 

@@ -173,9 +173,9 @@ def test_whoever_is_late_makes_no_folders(tmp_path):
     frames = _frames(tmp_path, "plain")
     given = files.folder, reconstruction(), frames, Cameras(), ExportFormat.TUM, "panorama"
     data = Dataset(*given, Placement(), ExportOptions())
-    writer = images.panorama_writer(data, files)
+    writers = images.panorama_writers(data, files)
     with pytest.raises(GsbaError, match=r"cannot write .*out/images/frame_0000.jpg: No such file"):
-        pictures.Pictures(frames, [writer])(0)
+        pictures.Pictures(frames, [writers])(0)
     assert not (tmp_path / "out").exists()
 
 

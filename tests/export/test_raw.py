@@ -36,7 +36,7 @@ def test_each_lens_has_a_picture_of_its_own(tmp_path: Path, layout: str) -> None
     frames, shown = _frames(tmp_path, layout)
     suffix = "jpg" if layout == "webp" else "png"
     files = Files(tmp_path, "01", "out{view}{suffix}", "mask{view}.png")
-    write_pictures(frames, [RawPictures(files, link=True)])
+    write_pictures(frames, [[RawPictures(files, link=True)]])
     for lens, wanted in enumerate(shown):
         read = pycolmap.Bitmap.read(tmp_path / f"out{lens}.{suffix}", True)
         found = read.to_array()
@@ -59,7 +59,7 @@ def test_masks_are_the_image_circles_of_each_frames_own_camera(tmp_path: Path) -
     ]
     frames = replace(frames_of(kinds[0], paths), formats=kinds, camera_of_frame=(0, 1))
     files = Files(tmp_path, "01", "out{name}{view}{suffix}", "mask{name}{view}.png")
-    write_pictures(frames, [RawPictures(files)])
+    write_pictures(frames, [[RawPictures(files)] * 2])
     for f, pair in enumerate(pairs):
         with Image.open(tmp_path / f"mask{f}0.png") as mask:
             assert mask.size == (pair[0].width, pair[0].height)

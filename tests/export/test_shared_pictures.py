@@ -42,8 +42,8 @@ def test_killed_workers_leave_no_trace(client, tmp_path: Path, monkeypatch) -> N
     export_all(reconstruction(), frames, here)
 
     def with_mishap(frames, writers, workers) -> None:
-        first = DiesWriting(writers[0].files, frames.names[4])
-        images.write_pictures(frames, [first, *writers], workers)
+        first = DiesWriting(writers[0][0].files, frames.names[4])
+        images.write_pictures(frames, [[first], *writers], workers)
 
     monkeypatch.setattr(formats, "write_pictures", with_mishap)
     monkeypatch.setattr(pictures, "even_blocks", lambda num: even_blocks(num, 2))
@@ -69,12 +69,12 @@ def test_a_dataset_that_workers_do_not_see_is_named(client, tmp_path: Path, monk
     files.folder.mkdir()
     given = files.folder, reconstruction(), frames, Cameras(), ExportFormat.TUM, "panorama"
     data = Dataset(*given, Placement(), ExportOptions())
-    writer = images.panorama_writer(data, files)
+    writers = images.panorama_writers(data, files)
     with (
         hired(client, tmp_path / "out", frames) as workers,
         pytest.raises(GsbaError, match=f"does not see {tmp_path}/unseen: put it on a disk"),
     ):
-        images.write_pictures(frames, [writer], workers)
+        images.write_pictures(frames, [writers], workers)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["frames"]
 
 

@@ -19,22 +19,18 @@ def frames(tmp_path_factory: pytest.TempPathFactory) -> FrameSet:
     return panoramas(tmp_path_factory.mktemp("scene") / "frames", ".jpg", masked=True)
 
 
-def _stop_after(num: int, patch: pytest.MonkeyPatch, error: type[BaseException]) -> None:
-    """Have exports end after so many frames."""
+def _stopped(frames: FrameSet, out: Path, to: ExportFormat, error: type[BaseException], **how):
+    """Have an export end after two frames."""
     real, calls = pictures.Pictures.__call__, itertools.count()
 
     def call(self: pictures.Pictures, item: int) -> None:
-        if next(calls) == num:
+        if next(calls) == 2:
             raise error("stop")
         real(self, item)
 
-    patch.setattr(images, "Threads", lambda _: Threads(1))
-    patch.setattr(pictures.Pictures, "__call__", call)
-
-
-def _stopped(frames: FrameSet, out: Path, to: ExportFormat, error: type[BaseException], **how):
     with pytest.MonkeyPatch.context() as patch, pytest.raises(error, match="stop"):
-        _stop_after(2, patch, error)
+        patch.setattr(images, "Threads", lambda _: Threads(1))
+        patch.setattr(pictures.Pictures, "__call__", call)
         export(reconstruction(), frames, out, to, **how)
 
 

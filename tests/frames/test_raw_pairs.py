@@ -273,7 +273,7 @@ def test_a_picture_that_is_missing(tmp_path: Path, layout: str, lens: int) -> No
     root = _write_pairs(tmp_path, layout)
     names = [name.format("001") for name in LAYOUTS[layout]]
     (root / names[lens]).unlink()
-    left, place = Path(names[1 - lens]).name, "_(00|10)_" if layout == "files" else names[lens][:4]
+    left, place = names[1 - lens], "_(00|10)_" if layout == "files" else names[lens][:4]
     message = rf"'{left}' has no picture in .*{place}.* of the other lens \(1 of 3\)"
     refused(message, scan, root, fps=1)
 
@@ -301,7 +301,7 @@ def test_a_picture_twice(tmp_path: Path) -> None:
         root = _write_pairs(tmp_path / layout, layout)
         path = root / LAYOUTS[layout][1].format("001")
         path.with_suffix(".jpg").write_bytes(path.read_bytes())
-        refused(r"001\.jpg' and '.*001\.png' are one lens's picture", scan, root, fps=1)
+        refused(r"001\.jpg' and '.*001\.png' are one frame's picture twice", scan, root, fps=1)
 
 
 def test_images_that_are_of_neither_lens(tmp_path: Path) -> None:

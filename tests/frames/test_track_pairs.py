@@ -22,7 +22,7 @@ from gsba.camera.rig import CubeRig
 from gsba.camera.sphere import erp_directions
 from gsba.camera.views import ViewCutter, cube_views, lens_views, rig_views
 from gsba.export.dataset import Dataset, ExportFormat, ExportOptions
-from gsba.export.images import panorama_writer, view_writer, write_pictures
+from gsba.export.images import panorama_writers, view_writers, write_pictures
 from gsba.export.pictures import Files
 from gsba.frames import cubemap, load_erp, load_grey, scan
 from gsba.frames.pixels import Buffers, load_padded, pictures_of
@@ -116,7 +116,7 @@ def test_exports_write_panoramas_and_faces(tmp_path: Path, frames: FrameSet) -> 
     views = cube_views(FACES, 64)
     given = tmp_path, reconstruction(), frames, Cameras(), ExportFormat.COLMAP, "cube"
     data = Dataset(*given, Placement(), ExportOptions())
-    writers = [panorama_writer(data, whole), view_writer(data, [faces], [views])]
+    writers = [panorama_writers(data, whole), view_writers(data, [faces], [views])]
     write_pictures(frames, writers)
     cut, _ = cubemap.load(frames, 2, CubeRig(64, np.pi / 2))
     for path, expected in [
@@ -143,7 +143,7 @@ def test_corrections_are_applied_in_the_same_step(frames: FrameSet) -> None:
 def test_what_cannot_be_read_is_refused(tmp_path: Path) -> None:
     folder = _fill(tmp_path / "a")
     (folder / "track5" / "1.png").unlink()
-    _refused(folder, "'track0/1.png' has no picture of that name in track5/ (1 of 3)")
+    _refused(folder, "'track0/1.png' has no picture in track5/ of the other lens (1 of 3)")
     (folder / "track0" / "1.png").unlink()
     _refused(folder, "2 frames; at least 3 are needed")
     folder = _fill(tmp_path / "b")
@@ -155,7 +155,7 @@ def test_what_cannot_be_read_is_refused(tmp_path: Path) -> None:
     _refused(folder, "pictures in 3 folders, track0, track3, track5")
     folder = _fill(tmp_path / "d")
     write(folder / "track5" / "2.png", np.zeros((SIZE, 3 * SIZE, 3), np.uint8))
-    _refused(folder, r"2.png: is 288x96, but 'track0/0.png' is 296x96: both tracks are of one size")
+    _refused(folder, r"2.png: is 288x96, but 'track0/0.png' is 296x96: both lenses")
     folder = tmp_path / "e"
     for track in ("track0", "track5"):
         for n in range(3):

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from command import fails, run_gsba, succeed
 from refusals import refused
-from video_files import Track, encode, steady, times_of
+from video_files import Track, encode, interrupt, steady, times_of
 
 from gsba.config import RefineSettings, VideoSettings
 from gsba.pipeline.inputs import extract_video
 from gsba.store.store import RunStore
-from gsba.video import extract, extraction, is_video, recording
+from gsba.video import extract, is_video, recording
 from gsba.video.recording import read_recording
 from gsba.video.timeline import PictureClaims
 
@@ -265,15 +265,8 @@ def test_an_interrupted_extraction_goes_on(
     settings = VideoSettings(every=4, sharpest=True)
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     extract(film, whole, settings)
-    write, calls = extraction.write_bytes, []
-
-    def fail_at_sixth(path: Path, content: bytes) -> None:
-        calls.append(path)
-        if len(calls) == 6:  # the front lens of the third frame is there, the back one is not
-            raise KeyboardInterrupt
-        write(path, content)
-
-    monkeypatch.setattr(extraction, "write_bytes", fail_at_sixth)
+    # the front lens of the third frame is there, the back one is not
+    calls = interrupt(monkeypatch, "write_bytes", 6)
     with pytest.raises(KeyboardInterrupt):
         extract(film, parts, settings)
     assert (

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from command import fails, run_gsba, succeed
 from refusals import refused
-from video_files import encode, steady, times_of
+from video_files import encode, interrupt, steady, times_of
 
 from gsba.config import VideoSettings
 from gsba.frames.scan import scan
@@ -153,15 +153,7 @@ def test_an_interrupted_extraction_goes_on(
     settings = VideoSettings(fps=6, sharpest=True)
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     extract(film, whole, settings)
-    encode, calls = extraction._encoded, []
-
-    def fail_at_fifth(*arguments: object) -> bytes:
-        calls.append(arguments)
-        if len(calls) == 5:
-            raise KeyboardInterrupt
-        return encode(*arguments)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(extraction, "_encoded", fail_at_fifth)
+    calls = interrupt(monkeypatch, "_encoded", 5)
     with pytest.raises(KeyboardInterrupt):
         extract(film, parts, settings)
     assert len(list(parts.glob("*.jpg"))) == 4 and not (parts / "timestamps.csv").exists()

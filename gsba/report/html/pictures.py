@@ -18,7 +18,6 @@ from gsba.types import FACES, FrameSet, Reconstruction, rows_across
 
 NUM_PICTURES = 6
 _WIDTH = 720  # pixels across an image
-_MAX_VECTORS = 350  # residuals in an image
 
 
 def worst_frames(reconstruction: Reconstruction) -> list[int]:
@@ -37,7 +36,7 @@ def picture(frames: FrameSet, reconstruction: Reconstruction, f: int) -> dict[st
         degrees of longitude and latitude.
     """
     rows = np.flatnonzero(reconstruction.observation_frames == f)
-    rows = rows[rows_across(len(rows), _MAX_VECTORS)]
+    rows = rows[rows_across(len(rows), 350)]  # more would hide the image
     bearings = reconstruction.observation_bearings[rows]
     residuals = np.degrees(residuals_of_rows(reconstruction, rows))
     level = np.maximum(np.hypot(bearings[:, 0], bearings[:, 2]), 0.05)
