@@ -10,14 +10,14 @@ from pathlib import Path
 
 from gsba.disk import disk_errors, hold_folder, refuse_links, remove_temporaries, remove_unheld
 from gsba.log import GsbaError, StoppedError
+from gsba.placement.world import read_placement
 from gsba.version import __version__
 
-MARKER = "export.json"  # {"gsba": version, "format": name, "map": `map_digest` of the map that it
-# holds, "wrote": top-level entries}
+MARKER = "export.json"  # {"gsba": version, "format": name, "wrote": top-level entries}
 
 
 @contextmanager
-def output_folder(out: Path, to: str, map_digest: str, key: str) -> Iterator[Path]:
+def output_folder(out: Path, to: str, key: str) -> Iterator[Path]:
     """Folder to write an export into; it becomes `out` when the block ends without an exception.
 
     An earlier export at `out` is replaced then. After an error the folder is deleted. After an
@@ -43,7 +43,7 @@ def output_folder(out: Path, to: str, map_digest: str, key: str) -> Iterator[Pat
         try:
             yield partial
             wrote = sorted([entry.name for entry in partial.iterdir()] + [MARKER])
-            marker = {"gsba": __version__, "format": to, "map": map_digest, "wrote": wrote}
+            marker = {"gsba": __version__, "format": to, "wrote": wrote}
             (partial / MARKER).write_text(json.dumps(marker, indent=1) + "\n")
             _require_replaceable(out)
             _swap_in(partial, out)
@@ -61,10 +61,10 @@ def datasets_of_other_maps(run: Path, map_digests: Container[str]) -> dict[str, 
     """Format by name of each dataset in a run's folder that holds none of the maps of the run."""
     found = dict[str, str]()
     for path in sorted(run.glob(f"*/{MARKER}")):
-        with suppress(OSError, ValueError, TypeError, KeyError):  # no marker of gsba's
-            marker = json.loads(path.read_text())
-            if marker["map"] not in map_digests:
-                found[path.parent.name] = marker["format"]
+        with suppress(OSError, ValueError, TypeError, KeyError, GsbaError):  # edited, or no dataset
+            to = json.loads(path.read_text())["format"]
+            if read_placement(path.with_name("transform.json")).map_digest not in map_digests:
+                found[path.parent.name] = to
     return found
 
 

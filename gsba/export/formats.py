@@ -86,7 +86,6 @@ def export_all(
     whole = reconstruction
     cameras = Cameras.of(options.lenses, frames)
     reconstruction, frames = one_map(whole, frames, map_number, "the reconstruction")
-    exported = map_digest(reconstruction, frames)
     cameras = cameras_of_map(cameras, whole, map_number)
     digest = map_digest(reconstruction, frames)
     # Frames (F',) int64 of a map that an export holds.
@@ -123,7 +122,7 @@ def export_all(
     writers: list[list[FrameWriter]] = []
     with ExitStack() as folders:
         for to, out in outs.items():
-            folder = output_folder(out, to.value, exported, content_digest(to.value, *key))
+            folder = output_folder(out, to.value, content_digest(to.value, *key))
             partial = folders.enter_context(folder)
             datasets.append(partial)
             writers += _write_dataset(partial, unplaced, frames, to, placement, seen_by, options)

@@ -120,11 +120,11 @@ def test_a_half_written_export_that_links_elsewhere_is_not_taken_up(
     os.mkfifo(tmp_path / ".out.partial-other")
     with (
         pytest.raises(GsbaError, match=_KINDS),
-        output_folder(tmp_path / "out", "colmap", "m" * 64, "k" * 64) as folder,
+        output_folder(tmp_path / "out", "colmap", "k" * 64) as folder,
     ):
         (folder / "some.npz").write_text("written")
     assert set(_contents(elsewhere).values()) == {"precious"}
-    with output_folder(tmp_path / "out", "colmap", "m" * 64, "z" * 64):
+    with output_folder(tmp_path / "out", "colmap", "z" * 64):
         pass  # waits for no pipe
 
 
