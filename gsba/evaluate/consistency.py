@@ -133,6 +133,8 @@ def consistency_of(
     held = np.zeros((len(poses), 3))
     held[far] = toward / np.linalg.norm(toward)
     judged = np.intersect1d(rows[rows > 0], known)
+    if not len(judged):
+        raise GsbaError("no frame but the first one has both a true pose and a covariance")
     errors = _errors(poses, true_T_rigs)
 
     steps, true_steps = map(relative_steps, (poses, true_T_rigs))

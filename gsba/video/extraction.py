@@ -286,7 +286,7 @@ def _take_over(out: Path, key: str, replace: bool) -> Counts | None:
     if not same and not replace:
         raise GsbaError(
             f"{out} holds another extraction (of {marker.get('video')}): choose another --out, or "
-            "--fresh to replace it"
+            "--fresh (of extract) to replace it"
         )
     with disk_errors(out):
         names = [*written, *(kept.name for kept in _read_journal(out, lenses))]

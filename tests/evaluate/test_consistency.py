@@ -107,6 +107,18 @@ def test_sigmas_that_are_off_by_two_are_found(factor: float) -> None:
     assert outside[:3].min() >= 14 and outside[3:].min() == len(SEEDS)
 
 
+def test_frames_without_covariances_prove_nothing() -> None:
+    """The two that fix the gauge alone have a true pose, and the second one was not refined."""
+    result, truth = _solved(0)
+    first = result.world_T_rigs[:, :3, 3] - result.world_T_rigs[0, :3, 3]
+    far = int(np.argmax(np.linalg.norm(first, axis=1)))
+    covariances = result.pose_covariances.copy()
+    covariances[far] = np.nan
+    result = replace(result, pose_covariances=covariances)
+    ends = Trajectory(TIMES[[0, far]], truth.world_T_rigs[[0, far]])
+    refused("no frame but the first one has both", consistency_of, result, TIMES, ends)
+
+
 def test_the_world_and_scale_of_the_truth_do_not_matter() -> None:
     result, truth = _solved(0)
     turn = pose(Rotation.from_rotvec([0.4, -2.0, 1.0]).as_matrix(), np.array([3.0, -40.0, 8.0]))
