@@ -4,8 +4,8 @@
 # a step leaves up to .91 of the error. So every call has another result. In the frame "NED", the default, the
 # horizontal and the vertical part of the magnetic reference are exchanged as well, which tilts all attitudes.
 # Expected of 300 attitudes, measured without noise: these, at each call. Seen in "ENU": half are off by more
-# than 18 degrees, 98 % by more than 1, and half change by more than 28 degrees at a second call. In "NED" none is
-# tilted by less than 15 degrees. `Davenport` finds all of them, to 1e-12 degrees.
+# than 18 degrees, 98 % by more than 1, and half change by more than 28 degrees at a second call. In "NED" none
+# is tilted by less than 15 degrees. `Davenport` finds all of them, to 1e-12 degrees.
 set -euo pipefail
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT

@@ -2,8 +2,8 @@
 # FFmpeg 9.0.2 (imageio-ffmpeg 0.8.1), filter v360 with its default, bilinear interpolation, of pictures with 16
 # bits a channel: the weights of the four pixels, as integers, can add up to more than one, and the sum of bright
 # ones beyond 65535 begins again at 0. What is white becomes black: clipped skies, masks, the far end of depths.
-# Expected of a turned white panorama: white. Seen: 83 % of its pixels are black (2 or 6 of 65535), in gray16, rgb48
-# and gbrp16. Values up to 65528, the other interpolations (cubic) and 8 or 12 bits have none.
+# Expected of a turned white panorama: white. Seen: 83 % of its pixels are black (2 or 6 of 65535), in gray16,
+# rgb48 and gbrp16. Values up to 65528, the other interpolations (cubic) and 8 or 12 bits have none.
 set -euo pipefail
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
