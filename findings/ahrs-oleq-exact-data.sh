@@ -1,8 +1,9 @@
 #!/usr/bin/env bash
-# AHRS 0.4.0, `OLEQ`, attitudes by an accelerometer and a magnetometer: of exact measurements they are wrong. The
-# power iteration starts at a random quaternion and ends after 21 steps, converged or not; at a dip of 60 degrees
-# a step leaves up to .91 of the error. So every call has another result. In the frame "NED", the default, the
-# horizontal and the vertical part of the magnetic reference are exchanged as well, which tilts all attitudes.
+# AHRS 0.4.0, `OLEQ`, attitudes by an accelerometer and a magnetometer: of exact measurements they are wrong.
+# The power iteration starts at a random quaternion and ends after 21 steps, converged or not; at a dip of 60
+# degrees a step leaves up to .91 of the error. So every call has another result. In the frame "NED", the
+# default, the horizontal and the vertical part of the magnetic reference are exchanged as well, which tilts all
+# attitudes.
 # Expected of 300 attitudes, measured without noise: these, at each call. Seen in "ENU": half are off by more
 # than 18 degrees, 98 % by more than 1, and half change by more than 28 degrees at a second call. In "NED" none
 # is tilted by less than 15 degrees. `Davenport` finds all of them, to 1e-12 degrees.
@@ -34,8 +35,9 @@ for frame, (up, field) in REFERENCES.items():
     errors, changes = degrees(first, attitudes), degrees(first, second)
     ups = first.apply(accelerations / 9.81)
     tilts = np.degrees(np.arccos(np.clip(ups @ up, -1, 1)))
-    print(f"{frame}: errors {np.median(errors):.1f} degrees (median), {(errors > 1).mean():.0%} above 1; tilts from "
-          f"{tilts.min():.1f} to {tilts.max():.1f}; changed by the second call: {np.median(changes):.1f}")
+    print(f"{frame}: errors {np.median(errors):.1f} degrees (median), {(errors > 1).mean():.0%} above 1; "
+          f"tilts from {tilts.min():.1f} to {tilts.max():.1f}; "
+          f"changed by the second call: {np.median(changes):.1f}")
     assert np.median(errors) > 10 and (errors > 1).mean() > 0.9 and np.median(changes) > 1
     assert frame == "ENU" or tilts.min() > 14.99, tilts.min()
 

@@ -35,8 +35,9 @@ for width, height in ((640, 480), (1280, 720), (638, 478)):
         greys.append(reference.mean())
         if step == 1:
             few, rim = corners(reference), reference[: height // 10].mean()
-    print(f"{width}x{height}: mean grey {np.round(greys, 1)}, top rows {before[: height // 10].mean():.1f} then "
-          f"{rim:.1f}; {many} corners, {few} after one call")
+    top = before[: height // 10].mean()
+    print(f"{width}x{height}: mean grey {np.round(greys, 1)}, top tenth {top:.1f} then {rim:.1f}; "
+          f"{many} corners, {few} after one call")
     if width == 638:
         assert np.array_equal(reference, before)
     else:
