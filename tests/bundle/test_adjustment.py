@@ -22,7 +22,8 @@ from gsba.bundle.trajectory_prior import TrajectoryPrior
 from gsba.config import RefineSettings
 from gsba.geometry import inverse, rotation_angle
 from gsba.similarity import pose_similarity
-from gsba.types import Counts, Sighted, Solution, Tracks
+from gsba.types import Counts, Sighted, Solution
+from gsba.types.records import with_rows
 
 SIGMA, CLAIMED = 5e-4, 3e-4  # radians: true noise of bearings, and what keypoints say of it
 GATES = (200.0, 60.0, 20.0, 8.0, 8.0)  # in claimed sigmas: the start is some 5 degrees off
@@ -139,10 +140,7 @@ def test_the_noise_does_not_depend_on_the_length_of_tracks(length: int) -> None:
     tracks, true = world.tracks, world.world_T_rigs
     firsts = np.searchsorted(tracks.points, tracks.points)
     kept = np.arange(len(tracks)) - firsts < length
-    short = Tracks(
-        tracks.points[kept], tracks.frames[kept], tracks.keypoints[kept], tracks.num_points
-    )
-    placed = triangulation.place(short, world.keypoints, true, 100.0)
+    placed = triangulation.place(with_rows(tracks, kept), world.keypoints, true, 100.0)
     freedom = 2 * len(placed.tracks) - 3 * placed.tracks.num_points
     redundancy = 1 - 6 * len(true) / freedom  # poses that are known take nothing
     noise = observation_noise(placed, world.keypoints, true, 1) * np.sqrt(redundancy)
@@ -257,13 +255,7 @@ def test_rounds_say_what_they_did() -> None:
 def test_poses_no_image_sees_keep_their_place_in_the_trajectory() -> None:
     """A frame without observations hangs on its neighbours' steps."""
     world, coarse = _world()
-    blind = world.tracks.frames != 7
-    tracks = replace(
-        world.tracks,
-        points=world.tracks.points[blind],
-        frames=world.tracks.frames[blind],
-        keypoints=world.tracks.keypoints[blind],
-    )
+    tracks = with_rows(world.tracks, world.tracks.frames != 7)
     solved = _run(replace(world, tracks=tracks), coarse, _settings())
     assert _position_rmse(solved.world_T_rigs, world.world_T_rigs) < 0.02
     # Its own steps are the drifting ones: 0.3 degrees and 1 % of 1.25 units, half from each side.

@@ -31,6 +31,7 @@ from gsba.camera.lens import Lenses
 from gsba.config import CameraSettings
 from gsba.similarity import pose_similarity
 from gsba.types import Keypoints, Solution, Tracks
+from gsba.types.records import with_rows
 
 CENTRE = np.array([0.004, -0.003, 0.05])
 BAND = np.deg2rad(4)
@@ -160,11 +161,8 @@ def test_what_is_asked_for_is_taken_and_too_little_is_named() -> None:
 def test_a_step_is_that_of_an_independent_solver() -> None:
     """Poses, points and the centre by SciPy's sparse least squares, without a robust loss."""
     world, shown = seen_through(Lenses(CENTRE, band_rad=BAND), 7)
-    few = world.tracks.points < 220
-    few &= ~world.false
-    tracks = Tracks(
-        world.tracks.points[few], world.tracks.frames[few], world.tracks.keypoints[few], 220
-    )
+    few = (world.tracks.points < 220) & ~world.false
+    tracks = replace(with_rows(world.tracks, few), num_points=220)
     plain = SETTINGS.model_copy(update={"camera": CameraSettings(model="two_lens")})
     exact = SolverOptions(relative_tolerance=1e-10, loss=RobustLoss())
     world = replace(world, tracks=tracks)

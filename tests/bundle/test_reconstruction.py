@@ -23,6 +23,7 @@ from gsba.types import (
     Reconstruction,
     Solution,
 )
+from gsba.types.records import with_rows
 
 SCALE = 0.25
 SLAM_R_WORLD = Rotation.from_rotvec([0.4, -1.0, 2.0]).as_matrix()
@@ -114,13 +115,7 @@ def _without_frame(world: World, frame: int, left: int) -> World:
     rows = np.flatnonzero(world.tracks.frames == frame)[left:]
     keep = np.ones(len(world.tracks), bool)
     keep[rows] = False
-    tracks = replace(
-        world.tracks,
-        points=world.tracks.points[keep],
-        frames=world.tracks.frames[keep],
-        keypoints=world.tracks.keypoints[keep],
-    )
-    return replace(world, tracks=tracks)
+    return replace(world, tracks=with_rows(world.tracks, keep))
 
 
 def test_unrefined_frames_are_told_and_have_no_say(world: World) -> None:

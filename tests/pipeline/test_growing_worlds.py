@@ -113,12 +113,12 @@ def test_only_maps_that_keep_their_world_are_held(monkeypatch: pytest.MonkeyPatc
     maps, state, held = _maps(), _joined(np.zeros(NUM + NEW, int)), list[np.ndarray]()
     monkeypatch.setattr(growing, "held_runs", lambda _: nullcontext())
     monkeypatch.setattr(growing.FinishedRun, "load", lambda _: maps.runs[0])
-    monkeypatch.setattr(growing._Place, "store", lambda *_: nullcontext(run_folder))
+    monkeypatch.setattr(growing, "_store_beside", lambda *_: nullcontext(run_folder))
     monkeypatch.setattr(growing, "refine_each", lambda *_, **__: None)
     monkeypatch.setattr(growing, "_joined", lambda *_: (state, maps))
     monkeypatch.setattr(growing.map_joining, "hold", lambda state, rows: held.append(rows) or state)
     monkeypatch.setattr(growing.map_joining, "tie", lambda state, _: state)
-    monkeypatch.setattr(growing._Place, "finish", lambda *_, held: held)
+    monkeypatch.setattr(growing, "_finish", lambda *_, held: held)
     run_folder = SimpleNamespace(root=Path("run"))
     kept = growing.add_recordings("run", [Recording("new")], fixed=True)
     assert cast(Any, kept).tolist() == held[0].tolist() == list(range(SMALL, NUM))
@@ -166,7 +166,7 @@ def test_a_run_grows_where_it_is_the_current_folder(
 ) -> None:
     (tmp_path / "run" / "stages").mkdir(parents=True)
     monkeypatch.chdir(tmp_path / "run")
-    assert growing._Place.of(place, None).out == tmp_path / "run"
+    assert growing._place_of(place, None) == tmp_path / "run"
     found = run_gsba("localize", tmp_path / "other", place)  # pictures of this folder
     fails(found, "is not a gsba run")
 
