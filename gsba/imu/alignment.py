@@ -291,8 +291,9 @@ def up_axis(
     scatter = float(np.degrees(np.median(np.arccos(np.clip(directions @ up, -1, 1)))))
     if scatter > _MAX_UP_SCATTER_DEG:
         logger.warning(
-            f"the accelerometer is not used: its vertical turns with the camera, by {scatter:.0f} "
-            "degrees in the median: check that its axes are those of the gyro"
+            "the accelerometer is not used: its vertical turns with the camera, by %.0f degrees in "
+            "the median: check that its axes are those of the gyro",
+            scatter,
         )
         return None
     return up

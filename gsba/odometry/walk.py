@@ -273,8 +273,11 @@ def track_panoramas(
     logger.info("%s", found.summary())
     for stretch in found.lost():
         logger.warning(
-            f"no pose from {stretch.first_s:.3f} to {stretch.last_s:.3f} s ({stretch.frames} "
-            "frames): too dark, covered, or nothing in common with what was seen before"
+            "no pose from %.3f to %.3f s (%d frames): too dark, covered, or nothing in common "
+            "with what was seen before",
+            stretch.first_s,
+            stretch.last_s,
+            stretch.frames,
         )
     return found
 

@@ -50,7 +50,9 @@ def fetch_where_weak(
         if not len(rows):
             break
         logger.info(
-            f"the map is weak in places: {len(rows)} more frames of the video, round {n + 1}"
+            "the map is weak in places: %d more frames of the video, round %d",
+            len(rows),
+            n + 1,
         )
         frames = _with_rows(store, video_file, walk, frames, settings, rows, n)
     return frames

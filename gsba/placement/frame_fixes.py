@@ -142,8 +142,11 @@ def _locked(source: str, fixes: GpsFixes) -> GpsFixes:
     if locked.all():
         return fixes
     logger.warning(
-        f"--gps {source}: {np.sum(~locked)} of {len(places)} positions are no fixes: they are "
-        "latitude 0, longitude 0, or repeat the position before"
+        "--gps %s: %d of %d positions are no fixes: they are latitude 0, longitude 0, or repeat "
+        "the position before",
+        source,
+        np.sum(~locked),
+        len(places),
     )
     rows = np.flatnonzero(locked).tolist()
     return replace(
@@ -164,9 +167,11 @@ def _on_one_clock(source: str, frames: FrameSet, times: np.ndarray) -> np.ndarra
         if begin < _UNIX_S and any(begin <= other[1] and other[0] <= end for other in spans):
             told[rows] = False
             logger.warning(
-                f"--gps {source}: its times are those of an earlier recording, not of '{name}', "
-                "whose clock shows the same: give positions of both by name, as "
-                f"'{frames.names[rows[0]]}'"
+                "--gps %s: its times are those of an earlier recording, not of '%s', whose clock "
+                "shows the same: give positions of both by name, as '%s'",
+                source,
+                name,
+                frames.names[rows[0]],
             )
         else:
             spans.append((begin, end))

@@ -79,8 +79,10 @@ def estimate_gravity(reconstruction: Reconstruction, frames: FrameSet) -> Gravit
         )
         gravity = Gravity(start, by_rigs, spread, 0, forces, tags)
     logger.info(
-        f"up: {gravity.num_edges} vertical edges, {gravity.turn_deg:.2f} degrees from the rigs' up "
-        f"axis (median deviation {spread:.2f})"
+        "up: %d vertical edges, %.2f degrees from the rigs' up axis (median deviation %.2f)",
+        gravity.num_edges,
+        gravity.turn_deg,
+        spread,
     )
     return gravity
 

@@ -239,9 +239,12 @@ def _warn_of_lenses(
     own = placement.grounds.get("gps", {}).get("scale_sigma", _MEASURED_SIGMA * scale) / scale
     if abs(np.log(scale / lens)) > _MAX_SCALE_SIGMAS * np.hypot(own, sigma / lens):
         logger.warning(
-            f"the run is placed with {scale:.4g} m to a map unit, but the distance between its "
-            f"lenses gives {lens:.4g} (sigma {100 * sigma / lens:.2g} %): check the length or "
-            "positions that were given, and the camera"
+            "the run is placed with %.4g m to a map unit, but the distance between its lenses "
+            "gives %.4g (sigma %.2g %%): check the length or positions that were given, and the "
+            "camera",
+            scale,
+            lens,
+            100 * sigma / lens,
         )
 
 
@@ -386,17 +389,20 @@ def _warn_of_lean(path: Path, ups: np.ndarray, tilt_sigma_deg: float) -> None:
     lean much more than the tilt is uncertain by: altitudes that jump or drift tilt a run."""
     if np.median(ups[:, 2]) < _UPSIDE_DOWN:
         logger.warning(
-            f"--gps {path}: the placed run is upside down: in the file, latitude and longitude are "
+            "--gps %s: the placed run is upside down: in the file, latitude and longitude are "
             "swapped, or a direction is reversed, unless the camera hung head down; --up auto "
-            "refuses such positions"
+            "refuses such positions",
+            path,
         )
         return
     held = ups.mean(axis=0)
     lean = float(np.degrees(np.arctan2(np.hypot(held[0], held[1]), held[2])))
     if np.linalg.norm(held) > 0.9 and lean > max(_MAX_LEAN_DEG, 3 * tilt_sigma_deg):
         logger.warning(
-            f"--gps {path}: as its positions place the run, the cameras lean by {lean:.0f} "
-            "degrees: unless they were held so, its altitudes are wrong: add --up auto"
+            "--gps %s: as its positions place the run, the cameras lean by %.0f degrees: unless "
+            "they were held so, its altitudes are wrong: add --up auto",
+            path,
+            lean,
         )
 
 

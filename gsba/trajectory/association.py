@@ -126,8 +126,11 @@ def associate(frames: FrameSet, trajectory: Trajectory, settings: ReadSettings) 
     if long.any():
         f = int(np.argmax(np.where(long, distance, 0)))
         _log.warning(
-            f"rough poses in gaps of the trajectory longer than {_MAX_INTERPOLATION_S:g} s: "
-            f"{long.sum()} (frame '{frames.names[f]}': {distance[f]:.1f} s)"
+            "rough poses in gaps of the trajectory longer than %g s: %d (frame '%s': %.1f s)",
+            _MAX_INTERPOLATION_S,
+            long.sum(),
+            frames.names[f],
+            distance[f],
         )
     return CoarsePoses(poses_at(trajectory, times), sources, offset)
 
@@ -171,8 +174,11 @@ def _clock_offset(frame_times: np.ndarray, entries: np.ndarray, stated: float | 
     overlap = "hardly overlap" if shared > 0 else "do not overlap"
     if len(found) == 1:
         _log.warning(
-            f"frames and trajectory {overlap} in time ({ranges}): the only offset at which all "
-            f"times meet, {found[0]:.6f} s, is added to frame times"
+            "frames and trajectory %s in time (%s): the only offset at which all times meet, "
+            "%.6f s, is added to frame times",
+            overlap,
+            ranges,
+            found[0],
         )
         return found[0]
     refuse_other_unit(frame_times, entries, senseless=True)

@@ -128,9 +128,13 @@ def _tracked(
         )
     if len(lost):
         _log.warning(
-            f"{path}: {len(lost)} of {len(known)} rows without a pose, as of lost frames (NaN, "
-            f"zeros, or positions beyond {MAX_COORDINATE:g}; the first is {where[lost[0]]}): left "
-            "out"
+            "%s: %d of %d rows without a pose, as of lost frames (NaN, zeros, or positions beyond "
+            "%g; the first is %s): left out",
+            path,
+            len(lost),
+            len(known),
+            MAX_COORDINATE,
+            where[lost[0]],
         )
     return np.flatnonzero(known)
 

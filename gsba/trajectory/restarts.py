@@ -48,9 +48,11 @@ def without_lost_frames(trajectory: Trajectory) -> Trajectory:
     if not lost.any() or np.count_nonzero(~lost) < 2:
         return trajectory
     _log.warning(
-        f"{lost.sum()} of {len(lost)} rows of the trajectory without a pose, as of lost frames "
-        "(they repeat the identity or the pose before; the first is of time "
-        f"{times[lost][0]:.6f}): left out"
+        "%d of %d rows of the trajectory without a pose, as of lost frames (they repeat the "
+        "identity or the pose before; the first is of time %.6f): left out",
+        lost.sum(),
+        len(lost),
+        times[lost][0],
     )
     return Trajectory(times[~lost], poses[~lost])
 
@@ -152,7 +154,8 @@ def _in_turn(pieces: Sequence[Trajectory]) -> list[Trajectory]:
             kept.append(trimmed)
         else:
             _log.warning(
-                f"a trajectory from {piece.timestamps[0]:.6f} to {piece.timestamps[-1]:.6f} s lies "
-                "within the time of another: not used"
+                "a trajectory from %.6f to %.6f s lies within the time of another: not used",
+                piece.timestamps[0],
+                piece.timestamps[-1],
             )
     return kept
