@@ -23,7 +23,9 @@ def _in_maps(components: np.ndarray = COMPONENTS) -> Reconstruction:
     seen = owners == components[whole.observation_frames]
     statuses = whole.pose_statuses.copy()
     statuses[7] = PoseStatus.UNREFINED
-    return observing(whole, seen, components=components, pose_statuses=statuses)
+    sure = np.tile(1e-12 * np.eye(6), (len(statuses), 1, 1))
+    known = {"pose_statuses": statuses, "pose_covariances": sure}
+    return observing(whole, seen, components=components, **known)
 
 
 def _report(tmp_path: Path, result: Reconstruction, reasons: tuple[str, ...] = ()) -> dict:
