@@ -131,13 +131,12 @@ def read_recording(video: Path) -> VideoRecording:
     return _recognised(video, files, tuple(track_sizes(files[0])), fingerprint(files))
 
 
-@lru_cache(
-    maxsize=8
-)  # to check, to follow and to extract a video, all of its packets are read once
+@lru_cache(maxsize=8)
 def _recognised(
     video: Path, files: tuple[Path, ...], sizes: tuple[tuple[int, int], ...], _state: object
 ) -> VideoRecording:
-    """Layout and times of the files of a video, in their state."""
+    """Layout and times of the files of a video, in their state: to check, to follow and to extract
+    it, all of its packets are read once."""
     size = sizes[0]
     if (cube := cube_tracks(files[0], sizes)) is not None:
         width, height = sizes[cube[0]]
