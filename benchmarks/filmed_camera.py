@@ -71,7 +71,7 @@ SMOOTH_S = 0.5  # standard deviation of the filter that separates hands from the
 _MAX_RADIANCE = 5.0  # of a saturated pixel
 FLOW_BAND_DEG = 10.0  # from the seam: within it lenses are aligned by optical flow
 _MARGIN_DEG = 14.0  # each lens is rendered to this angle beyond the seam: filters see no border
-# What scenes of `gsba demo` lack stands in the gallery, lit evenly, without shadows:
+# A door, a curtain and a mirror in the gallery of `gsba demo`, lit evenly, without shadows:
 DOOR_HINGE, DOOR_SIZE = np.array([-0.75, -2.4, -0.92]), (1.1, 2.4)  # beside the passage, units
 DOOR_OPENS, DOOR_DEG = (0.2, 0.35), 100.0  # shares of the walk's time, turn
 CURTAIN_CORNER, CURTAIN_SIZE = np.array([-4.5, -3.2, -4.8]), (2.4, 3.0)  # at the wall z = -5

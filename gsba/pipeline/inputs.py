@@ -76,10 +76,13 @@ def read_trajectories(
             )
         return [component for path in given for component in read_metashape(path)]
 
-    untimed = [path for name, path in origin.items() if name != "frames" and is_kitti(path)]
-    if timestamps is not None and not untimed and video.is_video(origin["frames"]):
-        held = "holds the times of its frames" + (", and its trajectory its own" if given else "")
-        raise GsbaError(f"a video {held}: leave out --timestamps")
+    if (
+        timestamps is not None
+        and video.is_video(origin["frames"])
+        and not any(is_kitti(path) for name, path in origin.items() if name != "frames")
+    ):
+        held = "the times of its frames" + (", and its trajectory its own" if given else "")
+        raise GsbaError(f"a video holds {held}: leave out --timestamps")
 
     def read(path: Path) -> Trajectory:
         return convention.poses(read_trajectory(path, timestamps))

@@ -42,7 +42,7 @@ def test_a_real_file_to_the_number() -> None:
     gyro = found.gyro
     assert gyro.rates.shape == gyro.accelerations.shape == (1178, 3)
     assert np.median(np.diff(gyro.times)) == pytest.approx(1e-3, rel=1e-6)
-    assert gyro.times[-1] == pytest.approx(1.040, abs=5e-4)
+    assert gyro.times[[0, -1]] == pytest.approx([-0.135, 1.040], abs=5e-4)
     # The first reading: u16 33475 32163 33163 32796 32618 33227 at 309334917 us.
     g = np.array([33475, 32163, 33163]) / 1024 - 32
     np.testing.assert_allclose(gyro.accelerations[0], 9.80665 * g)
@@ -54,6 +54,8 @@ def test_a_real_file_to_the_number() -> None:
     assert len(found.exposures.times) == 40
     np.testing.assert_allclose(found.exposures.durations, 0.0332, atol=5e-5)
     np.testing.assert_allclose(np.diff(found.exposures.times)[2:], 1 / 30, atol=2e-4)
+    range_ms = 1e3 * found.exposures.durations.min(), 1e3 * found.exposures.durations.max()
+    assert range_ms == pytest.approx((33.20, 33.24), abs=5e-3)
     assert found.gps is None and found.back_exposures is None  # its two fixes were made anonymous
     assert found.notes == ("GPS: 2 of 2 fixes are damaged or at 0, 0",)
     readings = read_imu(made.REAL)

@@ -155,7 +155,8 @@ def test_what_cannot_be_read_is_refused(tmp_path: Path) -> None:
     _refused(folder, "pictures in 3 folders, track0, track3, track5")
     folder = _fill(tmp_path / "d")
     write(folder / "track5" / "2.png", np.zeros((SIZE, 3 * SIZE, 3), np.uint8))
-    _refused(folder, r"2.png: is 288x96, but 'track0/0.png' is 296x96: both lenses")
+    one_size = "both lenses' pictures are of one size"
+    _refused(folder, f"2.png: is 288x96, but 'track0/0.png' is 296x96: {one_size}")
     folder = tmp_path / "e"
     for track in ("track0", "track5"):
         for n in range(3):

@@ -442,7 +442,7 @@ def test_positions_of_the_first_recording_place_no_map_of_another(
 def test_true_poses_of_several_recordings_are_on_one_clock(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """A recording that begins half a second late is a frame off on its own clock, as is said."""
+    """True poses on the clock of a recording that begins .5 s late are a frame off: a warning."""
     result, alone = walk_result(), frame_set(40)
     late = dataclasses.replace(alone, timestamps=alone.timestamps + 0.5)
     both = combine({name: _elsewhere(late, tmp_path / name) for name in ("one", "two")})
