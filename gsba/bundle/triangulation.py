@@ -9,7 +9,7 @@ from factors.compiled import kernel_and_part
 from factors.threads import balanced_ranges, run_in_threads
 from gsba.bundle.tracks import MAX_IN_MEMORY, map_runs
 from gsba.disk import concatenated
-from gsba.geometry import moved_to
+from gsba.geometry import moved_to, standing_length
 from gsba.memory import release_mapped_files
 from gsba.types import Counts, Keypoints, Landmarks, Reconstruction, Tracks
 
@@ -195,7 +195,8 @@ def triangulate(
         max_error_sigmas: gate on the angle between observation and point, in sigmas.
         origins_rig: (O, 3) rig frame, where each ray starts; None = the rig's centre.
         min_parallax_deg: largest angle between two rays of a point, at least: the depth of a point
-            with less is noise.
+            with less is noise. So is that of points nearer than the camera moves where it stands
+            (`standing_length`), whatever their parallax.
     """
     starts = np.searchsorted(tracks.points, np.arange(tracks.num_points + 1))
     rays, centres = np.empty((len(tracks), 3)), np.empty((len(tracks), 3))
@@ -218,12 +219,14 @@ def triangulate(
     lengths = np.bincount(tracks.points[inliers > 0], minlength=tracks.num_points)
     short = lengths < _MIN_TRACK_LENGTH
     flat = ~short & (parallaxes < np.deg2rad(min_parallax_deg))
-    dropped = {"observations disagree": short, "parallax too small": flat}
+    steps = np.linalg.norm(np.diff(world_T_rigs[:, :3, 3], axis=0), axis=1)
+    least = np.full(len(rays), standing_length(steps))
     if origins_rig is not None:
-        distances = np.linalg.norm(points[tracks.points] - centres, axis=1)
-        near = (inliers > 0) & (distances < np.linalg.norm(origins_rig, axis=1))
-        inside = np.bincount(tracks.points, near, len(points)) > 0
-        dropped["within the camera"] = inside & ~short & ~flat
+        least = np.maximum(least, np.linalg.norm(origins_rig, axis=1))
+    near = (inliers > 0) & (np.linalg.norm(points[tracks.points] - centres, axis=1) < least)
+    inside = np.bincount(tracks.points, near, len(points)) > 0
+    dropped = {"observations disagree": short, "parallax too small": flat}
+    dropped["too near"] = inside & ~short & ~flat
     kept = ~np.any(list(dropped.values()), axis=0)
     survivors = tracks.of_observations(kept[tracks.points] & (inliers > 0))
     numbers = {reason: int(flag.sum()) for reason, flag in dropped.items()}

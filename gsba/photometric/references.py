@@ -3,9 +3,10 @@
 import numpy as np
 
 from factors.compiled import kernel_and_part
+from gsba.geometry import standing_length
 from gsba.types import Landmarks
 
-_MAX_VIEWS = 16  # most frames that a point is aligned in
+_MAX_VIEWS = 16  # most places that a point is aligned at
 _NEAR_FRAMES = 40  # nearest frames in space that may show a point
 MAX_ANGLE_DEG = 45.0  # between two rays of a point
 MAX_RATIO = 1.8  # of a point's distances from two frames
@@ -33,24 +34,38 @@ def visible_frames(
 
     They are the frames of a point's observations, and for points of `extended (J,)` those near its
     reference, observation rows (J,), in space, at any time, that see it from a similar direction
-    and distance: the most similar first.
+    and distance: the most similar first, and one of those in which the camera stands.
     """
     centres = np.ascontiguousarray(world_T_rigs[:, :3, 3])
     frames, points = landmarks.tracks.frames, landmarks.points_world
-    num_near = min(_NEAR_FRAMES, len(centres) - 1)
+    places = _places(centres)
+    num_near = min(_NEAR_FRAMES, places[-1])
     near = np.empty((len(centres), num_near), np.int64)
     for f in np.unique(frames[rows]):
         distances = np.linalg.norm(centres - centres[f], axis=1)
-        distances[f] = -1
-        near[f] = np.argsort(distances, kind="stable")[1 : num_near + 1]
+        order = np.argsort(distances, kind="stable")
+        order = order[np.sort(np.unique(places[order], return_index=True)[1])]  # one of each place
+        near[f] = order[places[order] != places[f]][:num_near]
     room = len(frames) + _MAX_VIEWS * len(points)
     out = np.empty((2, room), np.int64)
     limits = np.cos(np.deg2rad(MAX_ANGLE_DEG)), MAX_RATIO
     num = _views(
-        _starts(landmarks), frames, centres, points, rows, near, *limits, _MAX_VIEWS,
+        _starts(landmarks), frames, places, centres, points, rows, near, *limits, _MAX_VIEWS,
         extended, out,
     )  # fmt: skip
     return out[0, :num].copy(), out[1, :num].copy()
+
+
+def _places(centres: np.ndarray) -> np.ndarray:
+    """Place (F,) int64, from 0, of each frame's centre (F, 3): consecutive frames in which the
+    camera stands are at one place, as views from there differ by their noise alone."""
+    least = standing_length(np.linalg.norm(np.diff(centres, axis=0), axis=1))
+    places, first = np.zeros(len(centres), np.int64), 0
+    for f in range(1, len(centres)):
+        moved = np.linalg.norm(centres[f] - centres[first]) > least
+        first = f if moved else first
+        places[f] = places[f - 1] + moved
+    return places
 
 
 def view_differences(
@@ -125,30 +140,34 @@ def _least(costs):
 
 @_kernel
 def _views(
-    starts, frames, centres, points, rows, near, min_cosine, max_ratio, max_views, extended, out
-):
+    starts, frames, places, centres, points, rows, near, min_cosine, max_ratio, max_views, extended,
+    out,
+):  # fmt: skip
     listed = np.empty(len(centres), np.int64)  # last point that listed each frame
+    seen = np.empty(len(centres), np.int64)  # last point that listed a frame of each place
     for frame in range(len(centres)):
-        listed[frame] = -1
+        listed[frame] = seen[frame] = -1
     costs = np.empty(near.shape[1])
     num = 0
     for j in range(len(points)):
         if starts[j] == starts[j + 1]:
             continue
         host = frames[rows[j]]
-        listed[host] = j
+        listed[host] = seen[places[host]] = j
         room = max_views
         for a in range(starts[j], starts[j + 1]):
             if listed[frames[a]] != j:
                 listed[frames[a]] = j
                 out[0, num], out[1, num] = j, frames[a]
                 num += 1
-                room -= 1
+                if seen[places[frames[a]]] != j:
+                    seen[places[frames[a]]] = j
+                    room -= 1
         if not extended[j]:
             continue
         for k in range(near.shape[1]):
             costs[k] = np.inf
-            if listed[near[host, k]] != j:
+            if seen[places[near[host, k]]] != j:
                 cosine, ratio, cost = _view_difference(
                     points[j], centres[host], centres[near[host, k]]
                 )

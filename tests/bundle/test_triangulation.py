@@ -94,7 +94,7 @@ def test_a_point_within_the_camera_is_none(distance: float, kept: int) -> None:
         _all_see_all(2, 1), bearings, np.full(2, SIGMA), world_T_rigs, 8.0, 1,
         np.stack([lens] * 2),
     )  # fmt: skip
-    assert found.counts.kept == kept and found.counts.dropped["within the camera"] == 1 - kept
+    assert found.counts.kept == kept and found.counts.dropped["too near"] == 1 - kept
 
 
 def test_a_standing_camera_makes_no_points() -> None:
@@ -102,6 +102,20 @@ def test_a_standing_camera_makes_no_points() -> None:
     world_T_rigs = np.stack([np.eye(4)] * 5)
     bearings = with_noise(_observe(_points(30, rng), world_T_rigs), SIGMA, rng)
     assert _run(bearings, world_T_rigs).counts.kept == 0
+
+
+def test_noise_of_a_camera_that_stands_for_a_while_makes_no_points() -> None:
+    """Positions off by noise meet rays off by noise close to the camera, at any angle."""
+    rng = np.random.default_rng(7)
+    world_T_rigs, points = loop_walk(9, 1.0), _points(300, rng)
+    world_T_rigs[3:] = world_T_rigs[3]
+    world_T_rigs[3:, :3, 3] += rng.normal(0, 1e-6, (6, 3))
+    noisy = with_noise(_observe(points, world_T_rigs), 20 * SIGMA, rng).reshape(300, 9, 3)
+    names = np.repeat(np.arange(300, dtype=np.int32), 2)
+    tracks = Tracks(names, np.tile(np.int32([3, 4]), 300), names.copy(), 300)
+    given = noisy[:, 3:5].reshape(-1, 3), np.full(600, 20 * SIGMA)
+    found = triangulation.triangulate(tracks, *given, world_T_rigs, 8.0)
+    assert found.counts.kept == 0 and found.counts.dropped["too near"] > 50
 
 
 def test_points_behind_are_refused() -> None:

@@ -46,6 +46,20 @@ def test_revisits_are_views_whatever_their_time(monkeypatch: pytest.MonkeyPatch)
     assert set(frames) == {0, 2, 5}
 
 
+def test_a_camera_that_stands_takes_no_views_from_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Twelve frames of one place are one view of the six, tracked or near."""
+    monkeypatch.setattr(references_, "_MAX_VIEWS", 6)
+    monkeypatch.setattr(references_, "_NEAR_FRAMES", 6)
+    x = np.r_[0, 1, 2, 3 + 0.01 * np.arange(12) % 0.03, 4, 5, 6]
+    standing = list(range(3, 15))
+    landmarks = _landmarks([[3, 0, 9], [2, 0, 9]], [standing, [2, 15]])
+    both = np.ones(2, bool)
+    points, frames = visible_frames(landmarks, _poses(x), np.array([5, 12]), both)
+    assert set(frames[points == 0]) == {*range(18)} - {8}
+    shown = frames[points == 1]
+    assert set(shown) >= {0, 1, 15, 16} and len(set(shown) & set(standing)) == 1
+
+
 def test_limits_hold(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(references_, "_MAX_VIEWS", 5)
     x = np.linspace(0, 1, 12)
