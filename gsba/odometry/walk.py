@@ -450,7 +450,8 @@ class _Steps:
 
 
 def _chosen(found: Odometry, steps: _Steps, longer: float) -> np.ndarray:
-    """Rows of frames at most `longer` steps apart, including the first of each map."""
+    """Rows of frames at most `longer` steps apart, in order of time, including the first of each
+    map; another map may lie between the parts of one."""
     out: list[int] = []
     posed = found.posed()
     for number in np.unique(found.maps[posed]):
@@ -459,7 +460,7 @@ def _chosen(found: Odometry, steps: _Steps, longer: float) -> np.ndarray:
         while here is not None:
             out.append(int(rows[here]))
             here = _next(rows, here, steps, longer, found.sharpness)
-    return np.array(out, np.int64)
+    return np.array(sorted(out), np.int64)
 
 
 def _next(
