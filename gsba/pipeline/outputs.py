@@ -205,7 +205,7 @@ def _findings(state: State, result: Reconstruction, gps: dict[str, Any] | None) 
     """Sections of the report on trajectory, camera and sensors, and notes on all that is odd."""
     prior, map_, frames = state.prior, state.map, state.run.frames
     trajectory, notes = findings.of_trajectory(
-        prior.trust, prior.clock, prior.merged, prior.joints, frames, prior.absent
+        prior.trust, prior.clock, prior.merged, prior.joints, frames, prior.unguided
     )
     camera, more = None, list[str]()
     if len(map_.cameras) == 1:
