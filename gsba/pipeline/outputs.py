@@ -255,7 +255,7 @@ def _of_camera(
         return None, []
     known = None if map_.covariances is None else map_.covariances.cameras[number]
     scale = world_scale(state.solution, result)
-    content, notes = of_camera(found, known, scale, run.settings_of(number), run.frames.timed)
+    content, notes = of_camera(found, known, scale, run.settings_of(number), run.is_timed(number))
     if kind.fisheyes is not None:
         content["lenses"], of_raw = of_lenses(found, known)
         notes += of_raw

@@ -213,6 +213,10 @@ class Run:
                 found[self.frames.cameras[rows[one.name][0]]] = one.camera
         return tuple(found)
 
+    def is_timed(self, camera: int) -> bool:
+        """True if timestamps of all frames that a camera took are times."""
+        return bool(self.frames.timed_frames[self.frames.cameras == camera].all())
+
     def settings_of(self, camera: int) -> CameraSettings:
         """Settings of one camera."""
         found = self.camera_settings
