@@ -6,6 +6,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from gsba.bundle.families import Family, MapSnapshot
 from gsba.bundle.gps_factors import GpsFactors
 from gsba.bundle.map_strength import MAX_SCALE_SIGMA
@@ -131,8 +133,9 @@ def _write_calibrations(state: State, result: Reconstruction, cameras: Cameras) 
         path.unlink()
     several = len(frames.formats) > 1
     baseline, metres = state.run.settings.camera.baseline(), None
-    if baseline is not None and result.lens_baseline is not None:
-        metres = metres_per_unit(result.lens_baseline, baseline)[0]
+    apart = result.lens_baseline
+    if baseline is not None and apart is not None and np.isfinite(apart[1]):
+        metres = metres_per_unit(apart, baseline)[0]
     for number, name in enumerate(names_of_cameras(frames)):
         rig = frames.formats[number].fisheyes
         if rig is not None:
