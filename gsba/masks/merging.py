@@ -5,7 +5,7 @@ read these files like given masks.
 """
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -188,15 +188,23 @@ def after(
     return merged, Counts(len(results), len(results) - len(reasons), "frames", dropped)
 
 
-def recut(store: RunStore, frames: FrameSet, cut: int) -> FrameSet:
-    """Raw pairs, with masks of an earlier cut, cut anew by a better calibration, the `cut`-th from
-    1, with the carrier detected again. Masks of anything else are kept."""
-    earlier = ["carrier.png", *(f"carrier{n}.png" for n in range(1, cut))]
-    if not set(frames.mask_paths) <= {store.root / name for name in earlier}:
-        return frames
-    carrier = _carrier(store, frames, False, f"carrier{cut}")
-    path = store.root / f"carrier{cut}.png" if carrier.share else None
-    return replace(frames, mask_paths=(path,) * len(frames))
+def recut(store: RunStore, frames: FrameSet, cut: int, cameras: Collection[int]) -> FrameSet:
+    """Raw pairs, with masks of an earlier cut, of which those of `cameras` are cut anew by a better
+    calibration, the `cut`-th from 1: the carrier of each of their recordings is detected again.
+    Masks of anything else are kept."""
+    masks = list(frames.mask_paths)
+    for recording, rows in (frames.recordings or {"": np.arange(len(frames))}).items():
+        of = f"@{recording}" if recording else ""
+        earlier = {store.root / f"carrier{n or ''}{of}.png" for n in range(cut)}
+        camera = frames.camera_of_frame[rows[0]] if frames.camera_of_frame else 0
+        if camera not in cameras or not {masks[f] for f in rows} <= earlier:
+            continue
+        own = frames.taken(rows) if recording else frames
+        name = f"carrier{cut}{of}"
+        path = store.root / f"{name}.png" if _carrier(store, own, False, name).share else None
+        for f in rows:
+            masks[f] = path
+    return replace(frames, mask_paths=tuple(masks))
 
 
 def _carrier(store: RunStore, frames: FrameSet, required: bool, name: str) -> Carrier:

@@ -404,7 +404,8 @@ def _solve_raw(run: Run) -> State:
                 for kind, cut in zip(frames.formats, better, strict=True)
             ]
         )
-        frames = merging.recut(run.store, frames, n)
+        cameras = [c for c, cut in enumerate(better) if cut is not None]
+        frames = merging.recut(run.store, frames, n, cameras)
         run = Run.begin(run.store, frames, run.coarse, run.settings, evidence, again, found)
 
 
