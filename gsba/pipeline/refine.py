@@ -258,7 +258,9 @@ def refine_from(
             return _map_features(frontend.extract(run)).prior
 
         frames = start.frames
-        whole = densify.fetch_where_weak(store, source, walk, frames, settings, measure)
+        known = [chosen.carrier, chosen.distractors, start.evidence.digests()]
+        known.append(callable(chosen.segment) or chosen.segment)
+        whole = densify.fetch_where_weak(store, source, walk, frames, settings, measure, known)
         start = start if whole is frames else Start.of(whole, given, settings)
     state, result = _in_order(
         lambda: _begin(store, settings, chosen, start),
