@@ -210,6 +210,12 @@ class CameraSettings(_Settings):
         # A published readout time differs between a camera's modes, by a sigma of a tenth.
         return None if ms is None else (1e-3 * ms, 1e-3 * 0.1 * ms)
 
+    def untimed(self) -> "CameraSettings":
+        """Settings without a readout time, for frames whose timestamps give only their order."""
+        known = self.baseline()
+        length = {} if known is None else {"baseline_mm": 1e3 * known[0]}
+        return self.model_copy(update={"name": None, "readout_ms": None, **length})
+
 
 class StitchingSettings(_Settings):
     """Stitching field: smooth offsets of bearings on the sphere, shared by all frames."""
@@ -375,11 +381,6 @@ class RefineSettings(_Settings):
     def package_families(self) -> tuple[str, ...]:
         """Families that packages provide."""
         return tuple(name for name in self.factors if name not in BUILT_IN)
-
-    def untimed(self) -> "RefineSettings":
-        """Settings without a readout time, for frames whose timestamps give only their order."""
-        camera = self.camera.model_copy(update={"name": None, "readout_ms": None})
-        return self.model_copy(update={"camera": camera})
 
     def with_gates(self, scale: float) -> "RefineSettings":
         """Settings with matching gates `scale` times as wide, for poorly calibrated lenses."""

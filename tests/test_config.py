@@ -11,7 +11,7 @@ from refusals import refused
 
 from gsba import config_file
 from gsba.cli.splat import splat_settings
-from gsba.config import RefineSettings
+from gsba.config import CameraSettings, RefineSettings
 from gsba.config_file import PRESETS, load_config, to_toml
 from gsba.log import GsbaError
 from gsba.store.finished import load_run
@@ -163,3 +163,12 @@ def test_images_that_a_format_has_no_place_for_are_refused_early() -> None:
 def test_no_training_takes_for_ever(iterations: str) -> None:
     with pytest.raises(GsbaError, match=r"--iterations \d+: Input should be (less|greater)"):
         splat_settings(int(iterations), None, "cpu")
+
+
+def test_frames_without_times_keep_the_distance_between_the_lenses() -> None:
+    """By which a radius of stitching that is given in metres is one in map units."""
+    camera = CameraSettings(name="insta360-x5", stitch_radius_m=2.0)
+    untimed = camera.untimed()
+    assert camera.readout() and untimed.readout() is None
+    assert untimed.inverse_stitch_radius(0.5) == camera.inverse_stitch_radius(0.5) == 0.016
+    assert CameraSettings(readout_ms=9.0).untimed() == CameraSettings()

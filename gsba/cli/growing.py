@@ -49,13 +49,14 @@ def add(
     conclude([result], allow_partial)
 
 
-def _refuse_changed(runs: list[Path]) -> None:
-    """Refuse runs whose frames are no longer those that they were made of."""
+def _refuse_changed(runs: list[Path], without: list[str] | None = None) -> None:
+    """Refuse runs whose frames, but those of some recordings, are no longer those that they were
+    made of."""
     from gsba.inspection.changed_frames import refuse_changed_frames
     from gsba.store.finished import load_run
 
     for run in runs:
-        refuse_changed_frames(run, *load_run(run))
+        refuse_changed_frames(run, *load_run(run), without or ())
 
 
 @command
@@ -91,6 +92,7 @@ def remove(
     """
     with loading():
         from gsba import pipeline
+    _refuse_changed([run], names)
     conclude([pipeline.remove_recordings(run, names, out)], allow_partial)
 
 

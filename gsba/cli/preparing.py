@@ -11,6 +11,7 @@ from gsba.log import GsbaError
 
 if TYPE_CHECKING:
     from gsba.config import VideoSettings
+    from gsba.video.extraction import Chosen
 
 
 @command
@@ -48,35 +49,42 @@ def extract(
     chosen = {key: value for key, value in options.items() if value is not None}
     chosen |= {"sharpest": sharpest} | ({"standing_deg": 0.0} if keep_standing else {})
     settings = validated({"video": chosen}).video
+    chosen_by = None
     if every == "auto":
-        path = _chosen_by_odometry(video, out, frames, fresh, settings)
+        path, chosen_by = _chosen_by_odometry(video, out, frames, fresh, settings)
         settings = settings.model_copy(update={"at": str(path)})
-    counts = write(video, out, settings, fresh)
+    counts = write(video, out, settings, fresh, chosen_by)
     why = ", ".join(f"{n} {reason}" for reason, n in counts.dropped.items() if n)
     typer.echo(f"{counts.kept} of {counts.received} frames kept{f' ({why})' if why else ''}: {out}")
 
 
 def _chosen_by_odometry(
     video: Path, out: Path, frames: int | None, fresh: bool, video_settings: "VideoSettings"
-) -> Path:
+) -> tuple[Path, "Chosen"]:
     """Trajectory file beside the folder of frames, with the poses of frames that odometry chose."""
     from gsba import odometry
     from gsba.config_file import validated
     from gsba.disk import with_own_name
     from gsba.frames.files import EXTRACTED
     from gsba.odometry.walk import write_chosen
-    from gsba.trajectory.files import read_trajectory
     from gsba.video import check_video
+    from gsba.video.extraction import Chosen, chosen_in
 
     named = with_own_name(out)
     path = named.with_name(f"{named.name}.tum")
-    if path.is_file() and (out / EXTRACTED).is_file() and not fresh:  # chosen before
-        if frames is not None and len(read_trajectory(path).timestamps) > frames:
-            raise GsbaError(
-                f"{out} holds more than {frames} frames, chosen before: choose another --out, or "
-                "--fresh to replace it"
-            )
-        return path
+    chosen, before = Chosen(path.name, frames), chosen_in(out)
+    own = before is not None and before.file == chosen.file
+    if (out / EXTRACTED).is_file() and before != chosen and not fresh:
+        raise GsbaError(
+            f"{out} holds frames that were chosen otherwise: choose another --out, or --fresh to "
+            "replace them"
+        )
+    if path.exists() and not own:
+        raise GsbaError(
+            f"{path}: poses of the chosen frames would replace it: move it, or choose another --out"
+        )
+    if path.is_file() and not fresh:  # chosen before
+        return path, chosen
     settings = validated({"odometry": {} if frames is None else {"max_frames": frames}}).odometry
     check_video(video, video_settings)
     begin, end = video_settings.from_s, video_settings.to_s
@@ -88,7 +96,7 @@ def _chosen_by_odometry(
             "choose them by --fps or --every N"
         )
     write_chosen(found, odometry.choose_frames(found, settings), path)
-    return path
+    return path, chosen
 
 
 @command

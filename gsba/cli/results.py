@@ -207,9 +207,10 @@ def evaluate(
     """
     from gsba.disk import write_json, write_text
 
+    of_splats = dict[str, Any]()
     if splat:
         settings = splat_settings(iterations, face_size, backend, max_gaussians)
-        evaluate_splat(estimate, against or [], settings, lpips or [])
+        of_splats["splat"] = evaluate_splat(estimate, against or [], settings, lpips or [])
     elif against or lpips or backend != "auto" or any((iterations, face_size, max_gaussians)):
         raise GsbaError(
             "--against, --iterations, --face-size, --max-gaussians, --backend and --lpips are of "
@@ -226,8 +227,8 @@ def evaluate(
     if truth is None:
         if not splat and scan is None:
             raise GsbaError("nothing to compare with: give --truth FILE, --scan FILE, or --splat")
-        if json_file is not None and on_scan:
-            write_json(json_file, on_scan)
+        if json_file is not None:
+            write_json(json_file, on_scan | of_splats)
         return
     # Compare a run or a trajectory with a true one: pose errors and induced pixel errors.
     from gsba.evaluate.pixels import depth_maps, induced_errors
@@ -250,7 +251,7 @@ def evaluate(
     if estimate.is_dir():
         claims, judged = _consistency(estimate, true)
     if json_file is not None:
-        content = errors.to_json() | ({"scan": on_scan} if on_scan else {})
+        content = errors.to_json() | of_splats | ({"scan": on_scan} if on_scan else {})
         content |= {"induced": asdict(induced)} if induced else {}
         content |= {"consistency": claims.to_json()} if claims else {}
         write_text(json_file, json.dumps(content, indent=1) + "\n")

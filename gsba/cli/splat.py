@@ -85,9 +85,10 @@ def render(
 
 def evaluate_splat(
     run: Path, against: Sequence[Path], settings: "TrainingOptions", lpips: Sequence[Path]
-) -> None:
-    """Train splats on the run's poses and on others, and compare their held-out frames."""
-    from gsba.evaluate.splats import format_table
+) -> dict[str, object]:
+    """Train splats on the run's poses and on others, and compare their held-out frames; gives what
+    is measured, by the name of each source, as plain values."""
+    from gsba.evaluate.splats import format_table, to_json
     from gsba.trajectory.files import read_trajectory
 
     out = run / "splat-evaluation"
@@ -101,6 +102,7 @@ def evaluate_splat(
     results = _compare(run, others, settings, out, lpips)
     typer.echo(format_table(results))
     typer.echo(f"Splats, images, curves and numbers are in {out}.")
+    return to_json(results)
 
 
 def _compare(

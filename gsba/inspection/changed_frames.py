@@ -1,5 +1,6 @@
 """Frames that were replaced by other pictures after a run was made of them."""
 
+from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
@@ -15,18 +16,23 @@ _MIN_CORRELATION = 0.35  # of brightness in frames and of the points there, the 
 # in 285 runs, whose least have very uneven exposures; .2 and less in frames of other places
 
 
-def refuse_changed_frames(run: Path, reconstruction: Reconstruction, frames: FrameSet) -> None:
+def refuse_changed_frames(
+    run: Path, reconstruction: Reconstruction, frames: FrameSet, without: Collection[str] = ()
+) -> None:
     """Refuse frames that show other things than the run's points, which have the frames' colours.
 
     Args:
         run: folder of the run, for the message.
         reconstruction: one map of the run.
         frames: its frames, of which three are read.
+        without: recordings whose frames are not read.
 
     Raises:
         GsbaError: most of these show other things, or one cannot be read.
     """
     observed = np.bincount(reconstruction.observation_frames, minlength=len(frames))
+    left_out = [rows for name, rows in frames.recordings.items() if name in without]
+    observed[[int(f) for rows in left_out for f in rows]] = 0
     rows = np.flatnonzero(observed >= _MIN_POINTS)
     if not len(rows):
         return

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsba.camera.rig import owner_faces
+from gsba.camera.rig import CubeRig, owner_faces
 from gsba.config import RefineSettings
 from gsba.features.detection import ExtractorTraits, FaceKeypoints
 from gsba.learned.interfaces import FaceNetwork
@@ -29,10 +29,10 @@ _UPRIGHT_FACES = [*product(range(4), range(4)), (4, 4), (5, 5)]
 _MIN_ALIKE_SHARE = 0.1  # of a face's mutual nearest neighbours
 
 
-def make_matcher(settings: RefineSettings, weights: Mapping[str, Path], size: int) -> Matcher:
-    """Matcher that `matching.matcher` and `features.extractor` choose for faces of `size` pixels:
-    guided search, or a learned network with weights by `find_weights`. GsbaError: the weights are
-    of another network, or a library is not installed."""
+def make_matcher(settings: RefineSettings, weights: Mapping[str, Path], rig: CubeRig) -> Matcher:
+    """Matcher that `matching.matcher` and `features.extractor` choose for faces of a rig: guided
+    search, or a learned network with weights by `find_weights`. GsbaError: the weights are of
+    another network, or a library is not installed."""
     name = settings.matching.matcher
     if name == "guided":
         return guided
@@ -40,10 +40,10 @@ def make_matcher(settings: RefineSettings, weights: Mapping[str, Path], size: in
         if name == "superglue":
             from gsba.learned.magicleap import SuperGlue
 
-            return FaceMatcher(SuperGlue(weights["matching"]), size)
+            return FaceMatcher(SuperGlue(weights["matching"]), rig)
         from gsba.learned.lightglue import LightGlue
 
-        return FaceMatcher(LightGlue(settings.features.extractor, weights["matching"]), size)
+        return FaceMatcher(LightGlue(settings.features.extractor, weights["matching"]), rig)
     except ImportError:
         raise missing_library(f"matching.matcher = {name}") from None
 
@@ -59,8 +59,8 @@ class FaceMatcher:
     are compared. Known points with a gate of a fraction of a degree are matched by `guided`.
     """
 
-    def __init__(self, network: FaceNetwork, size: int) -> None:
-        self._network, self._size = network, size
+    def __init__(self, network: FaceNetwork, rig: CubeRig) -> None:
+        self._network, self._rig = network, rig
 
     def __call__(
         self,
@@ -93,22 +93,23 @@ class FaceMatcher:
             )
             if min(len(k0), len(k1)) < 8:
                 continue
-            matched, score = self._network(_on_face(first, k0), _on_face(second, k1), self._size)
+            shown = self._on_face(first, k0), self._on_face(second, k1)
+            matched, score = self._network(*shown, self._rig.size)
             rows.append(np.column_stack([k0[matched[:, 0]], k1[matched[:, 1]]]))
             scores.append(score)
         found = np.concatenate(rows)
         inside = within_gate(found, first, second, f0_T_f1, gate, points_f0)
         return one_to_one(found[inside], np.concatenate(scores)[inside])
 
-
-def _on_face(features: Features, keypoints: np.ndarray) -> FaceKeypoints:
-    """Keypoints `keypoints` (n,) of one face."""
-    return FaceKeypoints(
-        features.pixels[keypoints],
-        features.sigmas_rad[keypoints],
-        features.descriptors[keypoints],
-        None if features.scores is None else features.scores[keypoints],
-    )
+    def _on_face(self, features: Features, keypoints: np.ndarray) -> FaceKeypoints:
+        """Keypoints `keypoints` (n,) of one face, as the rig shows it: frames of another run may
+        have been searched on faces of another size."""
+        return FaceKeypoints(
+            self._rig.project(features.bearings_rig[keypoints], features.faces[keypoints]),
+            features.sigmas_rad[keypoints],
+            features.descriptors[keypoints],
+            None if features.scores is None else features.scores[keypoints],
+        )
 
 
 def likeness(

@@ -5,8 +5,8 @@ read these files like given masks.
 """
 
 import logging
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
@@ -48,7 +48,24 @@ class Choice:
     distractors: bool
     segment: Segment | None
     carrier_required: bool = False  # True if an undetectable carrier is an error
-    without_carrier: tuple[str, ...] = ()  # of several recordings, those whose carrier stays
+    recordings: Mapping[str, "Choice"] = field(default_factory=dict)  # of each of several
+
+    @classmethod
+    def joined(cls, choices: Mapping[str, "Choice"]) -> "Choice":
+        """The choices of several recordings, by name. Files belong to each recording alone."""
+        each = choices.values()
+        return cls(
+            None,
+            any(one.carrier for one in each),
+            any(one.distractors for one in each),
+            next((one.segment for one in each), None),
+            any(one.carrier_required for one in each),
+            choices,
+        )
+
+    def of(self, recording: str) -> "Choice":
+        """The choice of one of several recordings, or that of all frames."""
+        return self.recordings.get(recording, self)
 
 
 def choose(masks: Masks, segment: Segment | None = None) -> Choice:
@@ -81,10 +98,9 @@ def before(store: RunStore, frames: FrameSet, choice: Choice) -> FrameSet:
         found = segmented(store, frames, choice.segment)
         parts.append(lambda f: load_segmented(found, frames, f))
         names.append("segmented")
-    if choice.carrier or padded(frames):
-        for name, mask in _borders(store, frames).items():
-            parts.append(mask)
-            names.append(name)
+    for name, mask in _borders(store, frames, choice).items():
+        parts.append(mask)
+        names.append(name)
     if choice.carrier:
         frames, more, stages = _carriers(store, frames, choice, alone=not parts)
         parts += more
@@ -96,11 +112,15 @@ def before(store: RunStore, frames: FrameSet, choice: Choice) -> FrameSet:
     return _merge(store, folder, frames, parts, names)
 
 
-def _borders(store: RunStore, frames: FrameSet) -> dict[str, Callable[[int], np.ndarray | None]]:
+def _borders(
+    store: RunStore, frames: FrameSet, choice: Choice
+) -> dict[str, Callable[[int], np.ndarray | None]]:
     """Masks of areas that are black in all frames of a recording, by the name of their stage."""
     parts: dict[str, Callable[[int], np.ndarray | None]] = {}
     for name, rows in (frames.recordings or {"": np.arange(len(frames))}).items():
         own = frames.taken(rows) if frames.recordings else frames
+        if not (choice.of(name).carrier or padded(own)):
+            continue
         found = find_borders(own)
         if not found.share:
             continue
@@ -121,9 +141,9 @@ def _carriers(
     stages = {name: f"carrier@{name}" if name else "carrier" for name in recordings}
     found: dict[str, Carrier] = {}
     for name, rows in recordings.items():
-        if name not in choice.without_carrier:
+        if choice.of(name).carrier:
             own = frames.taken(rows) if frames.recordings else frames
-            carrier = _carrier(store, own, choice.carrier_required, stages[name])
+            carrier = _carrier(store, own, choice.of(name).carrier_required, stages[name])
             if carrier.share:
                 found[name] = carrier
     turning = any(carrier.turns.any() for carrier in found.values())
@@ -143,11 +163,11 @@ def _carriers(
 
 
 def after(
-    store: RunStore, frames: FrameSet, solved: Solution, stage: str
+    store: RunStore, frames: FrameSet, choice: Choice, solved: Solution, stage: str
 ) -> tuple[FrameSet, Counts]:
     """Frames with masks of pixels that no static scene explains, by a first solution and its stage.
     Distractors are searched twice: the second pass does not compare pixels that the first one
-    marked in other frames."""
+    marked in other frames. Frames of recordings that do not ask for them are compared alone."""
     items = dict.fromkeys(frames.names)
 
     def look(name: str, before: PerFrame[Distractors] | None) -> PerFrame[Distractors]:
@@ -158,14 +178,19 @@ def after(
         return store.per_frame(name, None, items, compute, Distractors, behind)
 
     found = look("distractors", look("distractors1", None))
-    results = [found[name] for name in frames.names]
-    parts = [lambda f: distractor_weights(results[f])]
-    merged = _merge(store, store.root / _FOLDER, frames, parts, ["distractors"])
-    shares = np.array([one.share for one in results])
+    asking = {
+        f: name
+        for f, name in enumerate(frames.names)
+        if choice.of(name.rpartition("/")[0]).distractors
+    }
+    results = {f: found[name] for f, name in asking.items()}
+    parts = [lambda f: distractor_weights(results[f]) if f in results else None]
+    merged = _merge(store, store.root / _FOLDER, frames, parts, ["distractors"], [*asking.values()])
+    shares, rows_of = np.array([one.share for one in results.values()]), np.array([*results])
     check = store.root / "masks_check.jpg"
     if not (check.exists() and store.records["masks"].resumed):
         rows = []
-        for row in np.sort(np.argsort(-shares, kind="stable")[:_NUM_CHECK_FRAMES]):
+        for row in np.sort(rows_of[np.argsort(-shares, kind="stable")[:_NUM_CHECK_FRAMES]]):
             size = (_CHECK_WIDTH_PX, _CHECK_WIDTH_PX // 2)
             if merged.format_of(int(row)).panoramic:
                 shown = cv2.resize(load_erp(merged, int(row), width=_CHECK_WIDTH_PX), size)
@@ -179,24 +204,32 @@ def after(
             rows.append(shown)
         write_image(check, np.concatenate(rows), jpeg_quality=88)
     store.claim(check)
-    reasons = [one.reason.partition(":")[0] for one in results if one.reason]
-    for name, one in zip(frames.names, results, strict=True):
+    reasons = [one.reason.partition(":")[0] for one in results.values() if one.reason]
+    for f, one in results.items():
         if one.reason:
-            logger.warning("%s: not searched for distractors: %s", name, one.reason)
+            logger.warning("%s: not searched for distractors: %s", asking[f], one.reason)
     logger.info("distractors: %.1f%% of the pictures", 100 * shares.mean())
     dropped = {reason: reasons.count(reason) for reason in dict.fromkeys(reasons)}
     return merged, Counts(len(results), len(results) - len(reasons), "frames", dropped)
 
 
-def recut(store: RunStore, frames: FrameSet, cut: int) -> FrameSet:
-    """Raw pairs, with masks of an earlier cut, cut anew by a better calibration, the `cut`-th from
-    1, with the carrier detected again. Masks of anything else are kept."""
-    earlier = ["carrier.png", *(f"carrier{n}.png" for n in range(1, cut))]
-    if not set(frames.mask_paths) <= {store.root / name for name in earlier}:
-        return frames
-    carrier = _carrier(store, frames, False, f"carrier{cut}")
-    path = store.root / f"carrier{cut}.png" if carrier.share else None
-    return replace(frames, mask_paths=(path,) * len(frames))
+def recut(store: RunStore, frames: FrameSet, cut: int, cameras: Collection[int]) -> FrameSet:
+    """Raw pairs, with masks of an earlier cut, of which those of `cameras` are cut anew by a better
+    calibration, the `cut`-th from 1: the carrier of each of their recordings is detected again.
+    Masks of anything else are kept."""
+    masks = list(frames.mask_paths)
+    for recording, rows in (frames.recordings or {"": np.arange(len(frames))}).items():
+        of = f"@{recording}" if recording else ""
+        earlier = {store.root / f"carrier{n or ''}{of}.png" for n in range(cut)}
+        camera = frames.camera_of_frame[rows[0]] if frames.camera_of_frame else 0
+        if camera not in cameras or not {masks[f] for f in rows} <= earlier:
+            continue
+        own = frames.taken(rows) if recording else frames
+        name = f"carrier{cut}{of}"
+        path = store.root / f"{name}.png" if _carrier(store, own, False, name).share else None
+        for f in rows:
+            masks[f] = path
+    return replace(frames, mask_paths=tuple(masks))
 
 
 def _carrier(store: RunStore, frames: FrameSet, required: bool, name: str) -> Carrier:
@@ -230,9 +263,11 @@ def _merge(
     frames: FrameSet,
     parts: Sequence[Callable[[int], np.ndarray | None]],
     stages: Sequence[str],
+    known: object = None,
 ) -> FrameSet:
-    """Frames with masks `folder`/NAME.png of own masks and all parts ((h, 2h) bool, weights, None);
-    an unchanged file keeps its time, so that stages that depend on it resume."""
+    """Frames with masks `folder`/NAME.png of own masks and all parts ((h, 2h) bool, weights, None),
+    which the results of stages and what else is `known` make; an unchanged file keeps its time, so
+    that stages that depend on it resume."""
     paths = [folder / f"{name}.png" for name in frames.names]
 
     def compute() -> Counts:
@@ -256,7 +291,7 @@ def _merge(
     if not all(path.exists() for path in paths):
         store.forget(name)
     shapes = [(kind.width, kind.layout) for kind in frames.formats]
-    inputs = fingerprint(frames.mask_paths), shapes, frames.camera_of_frame
+    inputs = fingerprint(frames.mask_paths), shapes, frames.camera_of_frame, known
     store.stage(name, inputs, compute, Counts, stages)
     if name == "masks":
         store.claim(folder)

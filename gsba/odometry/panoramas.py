@@ -22,6 +22,8 @@ from gsba.frames.raw_pairs import lenses_of
 from gsba.frames.track_pairs import panorama_of
 from gsba.log import GsbaError
 from gsba.masks.carrier import PICTURE_WIDTH, find_fixed_carrier
+from gsba.store.shards import content_digest
+from gsba.store.store import fingerprint
 from gsba.types import FrameSet, rows_across
 from gsba.video.recording import (
     EXACT_S,
@@ -47,6 +49,7 @@ class SmallPanoramas:
     width: int  # pixels across
     read: Callable[[Sequence[int], bool], Iterator[tuple[int, np.ndarray]]]  # rows, in colour ->
     # (row, (h, 2h[, 3]) uint8, RGB); rows that are damaged are left out
+    contents: str  # digest of the files and of the lenses by which they are read
     usable: np.ndarray | None = None  # (h, 2h) bool, pixels that show the scene in every frame
 
     def __len__(self) -> int:
@@ -66,7 +69,9 @@ def of_frames(frames: FrameSet, source: Path, width: int = WIDTH) -> SmallPanora
             picture = load_erp(frames, row, not colour, width)
             yield row, cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
 
-    found = SmallPanoramas(source, frames.timestamps, width, read)
+    files = fingerprint(path for group in frames.paths for path in group)
+    contents = content_digest(files, frames.formats)
+    found = SmallPanoramas(source, frames.timestamps, width, read, contents)
     usable = np.ones(size[::-1], bool)
     if frames.format.fisheyes is not None:
         usable &= clear_of_seam(width // 2, frames.format.fisheyes)
@@ -127,7 +132,8 @@ def of_video(
                 whole = planes[0] if pair is None else join_pictures(planes, pair, width, share)
             yield number[index], cv2.resize(whole, size, interpolation=cv2.INTER_AREA)
 
-    return SmallPanoramas(video, recording.times[rows], width, read, usable)
+    contents = content_digest(fingerprint(track.path for track in recording.tracks), pair)
+    return SmallPanoramas(video, recording.times[rows], width, read, contents, usable)
 
 
 def without_carrier(panoramas: SmallPanoramas) -> SmallPanoramas:

@@ -23,7 +23,6 @@ from gsba.odometry.tracker import Tracker
 from gsba.odometry.tracker_state import FrameStatus, TrackerState
 from gsba.store.records import load_checkpoint, save_record
 from gsba.store.shards import Threads, content_digest
-from gsba.store.store import fingerprint
 from gsba.trajectory.files import read_trajectory, write_tum
 from gsba.types import Trajectory
 from gsba.video.likeness import sharpness
@@ -110,10 +109,8 @@ class _DistanceGone:
 def _key(panoramas: SmallPanoramas, seed: int, patience: int) -> str:
     """Digest of all that tracking rests on."""
     usable = np.ones(0, bool) if panoramas.usable is None else panoramas.usable
-    source = panoramas.source  # a folder is dated anew whenever something is written to it
-    files = fingerprint([source]) if source.is_file() else str(source)
     what = panoramas.width, seed, patience, __version__
-    return content_digest(files, panoramas.timestamps, usable, what)
+    return content_digest(panoramas.contents, panoramas.timestamps, usable, what)
 
 
 logger = logging.getLogger(__name__)
@@ -450,7 +447,8 @@ class _Steps:
 
 
 def _chosen(found: Odometry, steps: _Steps, longer: float) -> np.ndarray:
-    """Rows of frames at most `longer` steps apart, including the first of each map."""
+    """Rows of frames at most `longer` steps apart, in order of time, including the first of each
+    map; another map may lie between the parts of one."""
     out: list[int] = []
     posed = found.posed()
     for number in np.unique(found.maps[posed]):
@@ -459,7 +457,7 @@ def _chosen(found: Odometry, steps: _Steps, longer: float) -> np.ndarray:
         while here is not None:
             out.append(int(rows[here]))
             here = _next(rows, here, steps, longer, found.sharpness)
-    return np.array(out, np.int64)
+    return np.array(sorted(out), np.int64)
 
 
 def _next(

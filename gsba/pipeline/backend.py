@@ -306,28 +306,38 @@ def reconstruct(
         )
         return result if amended is None else amended(result)
 
-    published = [camera.baseline() for camera in run.camera_settings]  # of several, see `_baseline`
+    several = (*run.camera_settings, run.settings.camera) if run.camera_settings else ()
+    published = [camera.baseline() for camera in several]  # see `_baseline`
     return run.stage("reconstruction", [*run.solving_key(), *published], compute, Reconstruction)
 
 
 def _baseline(state: State, scale: float) -> tuple[float, float] | None:
-    """Distance of the first camera's lenses and its sigma, by published ones; None = none has two.
+    """Distance of the lenses that settings name and its sigma, by the cameras whose lenses were
+    found; None = none has two.
 
     Published distances of other cameras say the same of the map's scale (units per map unit): they
-    are averaged; where they contradict one another, sigma grows as they scatter.
+    are averaged; where they contradict one another, sigma grows as they scatter. It is infinite
+    where only lenses of unknown distance were found, not those that settings name.
     """
     run, found = state.run, list[tuple[tuple[float, float], tuple[float, float] | None]]()
     for number, camera in enumerate(state.map.cameras):
         if camera.centres is not None and camera.lenses:
             published = run.settings_of(number).baseline()
             found.append((baseline_of(camera.centres, scale), published))
+    if not found:
+        return None
     known = [(own, published) for own, published in found if published is not None]
-    if len(known) < 2:
-        return None if not found else (known or found)[0][0]
+    named = run.settings.camera.baseline()
+    if not known:
+        return found[0][0] if named is None else (found[0][0][0], float("inf"))
+    length, _ = named or known[0][1]
+    if len(known) == 1:
+        (own, sigma), (published, _) = known[0]
+        return own * (length / published), sigma * (length / published)
     metres = np.array([metres_per_unit(own, published) for own, published in known])
     weights = metres[:, 1] ** -2.0
     mean = float(weights @ metres[:, 0] / weights.sum())
-    length = known[0][1][0] / mean
+    length /= mean
     misfit = float(weights @ (metres[:, 0] - mean) ** 2) / (len(known) - 1)
     return length, length * float((max(misfit, 1.0) / weights.sum()) ** 0.5) / mean
 

@@ -2,7 +2,7 @@
 asked for."""
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -30,9 +30,11 @@ def fetch_where_weak(
     frames: FrameSet,
     settings: RefineSettings,
     measure: Callable[[FrameSet], Prior],
+    known: Sequence[object] = (),
 ) -> FrameSet:
     """Frames of a run, and between weak ones more of the video, until the map that `measure` solves
-    is strong, no frames are left between, or `odometry.fetch_rounds` are over."""
+    is strong, no frames are left between, or `odometry.fetch_rounds` are over; `known`: what that
+    map rests on beside frames and settings."""
     if len(set(frames.mask_paths)) > 1:
         logger.info("no frames are fetched: each frame has a mask of its own")
         return frames
@@ -42,6 +44,7 @@ def fetch_where_weak(
         name = f"fetch{n}"
         paths = [path for group in frames.paths for path in group] + list(set(frames.mask_paths))
         key = [settings.model_dump(exclude={"export", "placement"}), fingerprint(paths)]
+        key += [frames.formats, *known]
         rows = store.stored(name, key, np.ndarray, ())
         if rows is None:
             steps = weak_steps(measure(frames))

@@ -133,7 +133,7 @@ def _matchable(
         keypoints,
         settings,
         run.store.workers,
-        learned.make_matcher(settings, run.weights, run.rig.size),
+        learned.make_matcher(settings, run.weights, run.rig),
         Cameras.plain(run.frames),
     )
     return ObservedFrames(tuple(found), keypoints, context)

@@ -6,6 +6,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from gsba.bundle.families import Family, MapSnapshot
 from gsba.bundle.gps_factors import GpsFactors
 from gsba.bundle.map_strength import MAX_SCALE_SIGMA
@@ -131,8 +133,9 @@ def _write_calibrations(state: State, result: Reconstruction, cameras: Cameras) 
         path.unlink()
     several = len(frames.formats) > 1
     baseline, metres = state.run.settings.camera.baseline(), None
-    if baseline is not None and result.lens_baseline is not None:
-        metres = metres_per_unit(result.lens_baseline, baseline)[0]
+    apart = result.lens_baseline
+    if baseline is not None and apart is not None and np.isfinite(apart[1]):
+        metres = metres_per_unit(apart, baseline)[0]
     for number, name in enumerate(names_of_cameras(frames)):
         rig = frames.formats[number].fisheyes
         if rig is not None:
@@ -205,7 +208,7 @@ def _findings(state: State, result: Reconstruction, gps: dict[str, Any] | None) 
     """Sections of the report on trajectory, camera and sensors, and notes on all that is odd."""
     prior, map_, frames = state.prior, state.map, state.run.frames
     trajectory, notes = findings.of_trajectory(
-        prior.trust, prior.clock, prior.merged, prior.joints, frames, prior.absent
+        prior.trust, prior.clock, prior.merged, prior.joints, frames, prior.unguided
     )
     camera, more = None, list[str]()
     if len(map_.cameras) == 1:
@@ -255,7 +258,7 @@ def _of_camera(
         return None, []
     known = None if map_.covariances is None else map_.covariances.cameras[number]
     scale = world_scale(state.solution, result)
-    content, notes = of_camera(found, known, scale, run.settings_of(number), run.frames.timed)
+    content, notes = of_camera(found, known, scale, run.settings_of(number), run.is_timed(number))
     if kind.fisheyes is not None:
         content["lenses"], of_raw = of_lenses(found, known)
         notes += of_raw

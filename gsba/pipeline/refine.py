@@ -176,16 +176,8 @@ def refine_each(
     ]
     settings = with_camera(plain, given)
     check(settings.placement, baseline=settings.camera.baseline())
-    # Sources of masks of all recordings; files belong to each recording alone.
-    choices = {one.name: merging.choose(one.recording.masks, segment) for one in given}
-    every = list(choices.values())
-    chosen = merging.Choice(
-        None,
-        any(one.carrier for one in every),
-        any(one.distractors for one in every),
-        segment,
-        any(one.carrier_required for one in every),
-        tuple(name for name, one in choices.items() if not one.carrier),
+    chosen = merging.Choice.joined(
+        {one.name: merging.choose(one.recording.masks, segment) for one in given}
     )
     origin = {name: path for one in given for name, path in one.files.items()}
     given, fresh, extracted = with_videos(given, out, origin, settings, fresh)
@@ -266,7 +258,9 @@ def refine_from(
             return _map_features(frontend.extract(run)).prior
 
         frames = start.frames
-        whole = densify.fetch_where_weak(store, source, walk, frames, settings, measure)
+        known = [chosen.carrier, chosen.distractors, start.evidence.digests()]
+        known.append(callable(chosen.segment) or chosen.segment)
+        whole = densify.fetch_where_weak(store, source, walk, frames, settings, measure, known)
         start = start if whole is frames else Start.of(whole, given, settings)
     state, result = _in_order(
         lambda: _begin(store, settings, chosen, start),
@@ -317,13 +311,17 @@ def _begin(store: RunStore, settings: RefineSettings, chosen: merging.Choice, st
     tell_size(settings, start.frames, width, given)
     journal, frames = Journal(), merging.before(store, start.frames, chosen)
     if chosen.distractors:
-        frames = _without_distractors(store, settings, start.on(frames, settings), journal)
+        frames = _without_distractors(store, settings, chosen, start.on(frames, settings), journal)
     start = start.on(tour.in_known_order(store, frames, settings), settings)
     return Run.begin(store, start.frames, start.coarse, settings, start.evidence, journal)
 
 
 def _without_distractors(
-    store: RunStore, settings: RefineSettings, start: Start, journal: Journal
+    store: RunStore,
+    settings: RefineSettings,
+    chosen: merging.Choice,
+    start: Start,
+    journal: Journal,
 ) -> FrameSet:
     """The frames, in the order given, with masks of what a first, plainer solution does not
     explain."""
@@ -342,7 +340,7 @@ def _without_distractors(
     if state.prior.turning_only:
         return start.frames
     first = f"first-{run.latest[0]}"
-    masked, counts = merging.after(store, run.frames, state.solution, first)
+    masked, counts = merging.after(store, run.frames, chosen, state.solution, first)
     journal.note("distractors", counts)
     masks = dict(zip(masked.names, masked.mask_paths, strict=True))
     return replace(start.frames, mask_paths=tuple(masks[name] for name in start.frames.names))
@@ -404,7 +402,8 @@ def _solve_raw(run: Run) -> State:
                 for kind, cut in zip(frames.formats, better, strict=True)
             ]
         )
-        frames = merging.recut(run.store, frames, n)
+        cameras = [c for c, cut in enumerate(better) if cut is not None]
+        frames = merging.recut(run.store, frames, n, cameras)
         run = Run.begin(run.store, frames, run.coarse, run.settings, evidence, again, found)
 
 

@@ -71,6 +71,11 @@ class Evidence:
     # frames, which then have their trajectories and gyros from here; () = there is one recording
     start: RunStart = RunStart.TRAJECTORY  # for the report
 
+    def digests(self) -> list[object]:
+        """What tells the gyro and the families from others."""
+        families = [(family.name, family.digest) for family in self.families]
+        return [None if self.imu is None else self.imu.digest, families]
+
     def start_name(self, absent: bool) -> str:
         """Name of the source of the initial poses, for the report."""
         if absent:
@@ -212,6 +217,10 @@ class Run:
             if one.camera is not None:
                 found[self.frames.cameras[rows[one.name][0]]] = one.camera
         return tuple(found)
+
+    def is_timed(self, camera: int) -> bool:
+        """True if timestamps of all frames that a camera took are times."""
+        return bool(self.frames.timed_frames[self.frames.cameras == camera].all())
 
     def settings_of(self, camera: int) -> CameraSettings:
         """Settings of one camera."""

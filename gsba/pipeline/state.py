@@ -157,14 +157,19 @@ class State:
         return self._context(observing.with_members((*own, *observing.members)))
 
     def _context(self, families: Families) -> AdjustmentContext:
-        run = self.run
+        run, settings = self.run, self.run.settings
+        if not run.frames.timed:
+            settings = settings.model_copy(update={"camera": settings.camera.untimed()})
         return AdjustmentContext(
             families=families,
             rig=run.rig,
-            settings=run.settings if run.frames.timed else run.settings.untimed(),
+            settings=settings,
             num_threads=run.num_threads,
             maps=self.prior.parts,
-            cameras=run.camera_settings,
+            cameras=tuple(
+                camera if run.is_timed(number) else camera.untimed()
+                for number, camera in enumerate(run.camera_settings)
+            ),
             division=run.division,
             scratch=run.store.scratch_folder,
         )

@@ -223,6 +223,11 @@ def _scale_by_lenses(
             "--scale lens: the run found no two lenses (for the reason see camera in report.json): "
             "scale it by --scale LENGTH --between A B"
         )
+    if not np.isfinite(reconstruction.lens_baseline[1]):
+        raise GsbaError(
+            "--scale lens: of the cameras whose lenses were found none has a known distance "
+            "between them (see cameras in report.json): scale it by --scale LENGTH --between A B"
+        )
     assert baseline is not None  # see check
     scale, sigma = metres_per_unit(reconstruction.lens_baseline, baseline)
     return (scale, sigma), {"baseline_m": baseline[0], "scale_sigma": sigma}

@@ -27,16 +27,17 @@ def of_trajectory(
     merged: Registered | None,
     joints: tuple[SegmentAlignment, ...],
     frames: FrameSet,
-    absent: bool = False,
+    unguided: np.ndarray | None = None,
 ) -> tuple[dict[str, Any], list[str]]:
     """Checks of the trajectory by images, for report.json, and notes.
 
     Args:
         clock: its clock; None = not checked.
         merged: parts of the map that were joined; None = the map never was in parts.
-        absent: True = there is no trajectory, so that images contradict none of its steps.
+        unguided: (F,) bool, frames of recordings without a trajectory, of which images contradict
+            no step; None = all have one.
     """
-    found, notes = _steps(trust, frames, absent)
+    found, notes = _steps(trust, frames, unguided)
     if clock is not None:
         found |= {"clock": clock_section(clock)}
         if clock.verdict == "corrected":
@@ -48,18 +49,24 @@ def of_trajectory(
     return found | maps, notes + more
 
 
-def _steps(trust: StepChecks, frames: FrameSet, absent: bool) -> tuple[dict[str, Any], list[str]]:
-    """Contradicted and unseen steps by the names of their frames, for the report, and notes."""
-    names = np.array(frames.names)
+def _steps(
+    trust: StepChecks, frames: FrameSet, unguided: np.ndarray | None
+) -> tuple[dict[str, Any], list[str]]:
+    """Contradicted, unseen and held steps by the names of their frames, for the report, and
+    notes."""
+    names, owners = np.array(frames.names), frames.recording_of_frame
+    given = np.ones(len(names), bool) if unguided is None else ~unguided
+    inside = owners[1:] == owners[:-1]  # not from one recording to the next
 
     def between(chosen: np.ndarray) -> list[Any]:
         return [[names[f], names[f + 1]] for f in np.flatnonzero(chosen).tolist()]
 
-    false = [] if absent else names[trust.false_frames].tolist()
+    false = names[trust.false_frames & given].tolist()
     judgement = {
         "false_frames": false,
-        "false_steps": [] if absent else between(trust.false_steps),
-        "unseen_steps": between(trust.unseen_steps),
+        "false_steps": between(trust.false_steps & inside & given[1:] & given[:-1]),
+        "unseen_steps": between(trust.unseen_steps & inside),
+        "held_steps": between(trust.held_steps),
     }
     notes = []
     if false:

@@ -138,8 +138,7 @@ def _held_steps(report: Mapping[str, Any], names: Sequence[str]) -> tuple[int, .
     checks, rows = report["trajectory"] or {}, {name: row for row, name in enumerate(names)}
     if _has_no_start(report):
         return ()
-    false = set(map(tuple, checks.get("false_steps", ())))
-    held = [step for step in map(tuple, checks.get("unseen_steps", ())) if step not in false]
+    held = checks.get("held_steps", ())
     return tuple(rows[a] for a, b in held if a in rows and b in rows)
 
 

@@ -499,7 +499,7 @@ class Reconstruction:
     observation_origins: np.ndarray | None = None  # (O, 3) float64, rig frame, map units: origin of
     # each ray; None = the rig's centre
     lens_baseline: tuple[float, float] | None = None  # distance of the two lenses and its standard
-    # deviation, map units; None = one centre
+    # deviation, map units, infinite if only lenses that no setting names were found; None = one
     vertical: np.ndarray | None = None  # (3,) float64, unit, up or down by an accelerometer; None =
     # there was none
     map_scales: np.ndarray | None = None  # (C,) float64, units of each component's world per unit

@@ -65,14 +65,29 @@ class _Kept:
     standing: int  # number of earlier windows that were left out because the camera stood
 
 
-def extract(video: Path, out: Path, settings: VideoSettings, replace: bool = False) -> Counts:
+@dataclass(frozen=True, slots=True)
+class Chosen:
+    """What the frames of an extraction were chosen by, where odometry chose them."""
+
+    file: str  # name of the TUM file of their poses, beside their folder
+    max_frames: int | None  # that were asked for
+
+
+def extract(
+    video: Path,
+    out: Path,
+    settings: VideoSettings,
+    replace: bool = False,
+    chosen_by: Chosen | None = None,
+) -> Counts:
     """Write frames of a 360-degree video, 2:1, GoPro's `.360`, or raw of two lenses (see
     `gsba.video.recording`), either file of a pair, to a folder that `gsba.frames.scan` reads;
     returns numbers of frames in the range, of kept frames, and of dropped ones by reason.
 
     Times are the container's presentation times since the first frame, also for variable frame
     rates. An interrupted call resumes; another extraction in the folder is replaced if `replace`.
-    Raises GsbaError: the video or the folder cannot be used, or no frame is in the range.
+    `chosen_by` is kept for `chosen_in`. Raises GsbaError: the video or the folder cannot be used,
+    or no frame is in the range.
     """
     trajectory = None if settings.at is None else Path(settings.at)
     if settings.at is not None and settings.sharpest:
@@ -91,7 +106,8 @@ def extract(video: Path, out: Path, settings: VideoSettings, replace: bool = Fal
     windows, received = _usable_windows(video, recording, settings)
     for note in recording.notes:
         logger.info("%s", note)
-    _write_marker(out, video, key, None, recording.folders)
+    marker = _Marker(video, key, recording.folders, chosen_by)
+    _write_marker(out, marker, None)
     if recording.lenses:
         found = factory_calibration_of(recording)
         if found is not None:
@@ -106,7 +122,7 @@ def extract(video: Path, out: Path, settings: VideoSettings, replace: bool = Fal
     counts = Counts(received, len(kept), "frames", left_out)
     rows = "".join(f"{entry.name},{entry.timestamp!r}\n" for entry in kept)
     write_text(out / TIMES, "name,timestamp\n" + rows)
-    _write_marker(out, video, key, counts, recording.folders)
+    _write_marker(out, marker, counts)
     (out / _JOURNAL).unlink(missing_ok=True)
     dropped = ", ".join(f"{n} {reason}" for reason, n in counts.dropped.items() if n)
     logger.info("%s: kept %d of %d frames (%s)", out, counts.kept, received, dropped or "all")
@@ -277,7 +293,7 @@ def _take_over(out: Path, key: str, replace: bool) -> Counts | None:
         lenses = next((names for names in known if list(names) == marker["lenses"]), LENSES[:0])
         same = marker["key"] == key
     except (OSError, ValueError, TypeError, KeyError, RecursionError, RecordError):
-        raise GsbaError(f"{out} is not empty and not an extraction: choose another --out") from None
+        raise _unlike(out) from None
     path = out / TIMES
     written = [row.name for row in read_times(path) if row.name] if path.is_file() else []
     folders = _folders(out, lenses)
@@ -313,15 +329,40 @@ def _remove_images(out: Path, lenses: Sequence[str], names: Sequence[str]) -> No
             folder.rmdir()
 
 
-def _write_marker(
-    out: Path, video: Path, key: str, counts: Counts | None, lenses: Sequence[str]
-) -> None:
-    entries = None if counts is None else asdict(counts)
-    marker = {"gsba": __version__, "video": str(video.resolve()), "key": key, "counts": entries}
-    if lenses:
-        marker["lenses"] = list(lenses)
-    text = json.dumps(marker, indent=1, ensure_ascii=False) + "\n"
-    write_text(out / EXTRACTED, text)
+@dataclass(frozen=True, slots=True)
+class _Marker:
+    """What a folder of frames holds."""
+
+    video: Path
+    key: str
+    lenses: Sequence[str]
+    chosen_by: Chosen | None
+
+
+def _write_marker(out: Path, marker: _Marker, counts: Counts | None) -> None:
+    entries: dict[str, object] = {"gsba": __version__, "video": str(marker.video.resolve())}
+    entries |= {"key": marker.key, "counts": None if counts is None else asdict(counts)}
+    if marker.lenses:
+        entries["lenses"] = list(marker.lenses)
+    if marker.chosen_by is not None:
+        entries["chosen_by"] = asdict(marker.chosen_by)
+    write_text(out / EXTRACTED, json.dumps(entries, indent=1, ensure_ascii=False) + "\n")
+
+
+def chosen_in(out: Path) -> Chosen | None:
+    """What the frames of an extraction were chosen by; None = no odometry chose them, or there is
+    no extraction. GsbaError: the folder holds something else."""
+    if not (out.is_dir() and any(out.iterdir())):
+        return None
+    try:
+        marker = json.loads((out / EXTRACTED).read_text(encoding="utf-8"))
+        return typed(marker.get("chosen_by"), Chosen | None)  # type: ignore[arg-type]
+    except (OSError, ValueError, AttributeError, RecursionError, RecordError):
+        raise _unlike(out) from None
+
+
+def _unlike(out: Path) -> GsbaError:
+    return GsbaError(f"{out} is not empty and not an extraction: choose another --out")
 
 
 def _read_journal(out: Path, lenses: Sequence[str]) -> list[_Kept]:

@@ -1,5 +1,7 @@
 """Frames chosen by what they show: how far apart, how sharp, how many."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -8,7 +10,8 @@ from gsba.config import OdometrySettings
 from gsba.geometry import pose, rotation_angle
 from gsba.odometry import Odometry, choose_frames
 from gsba.odometry.tracker_state import FrameStatus
-from gsba.odometry.walk import MAX_TURN_DEG
+from gsba.odometry.walk import MAX_TURN_DEG, write_chosen
+from gsba.trajectory.files import read_trajectory
 
 SETTINGS = OdometrySettings()
 
@@ -96,6 +99,16 @@ def test_lost_frames_are_left_out_and_maps_stay_apart() -> None:
     assert {0, 50} <= set(rows.tolist())
     assert [len(piece.timestamps) for piece in found.pieces()] == [40, 50]
     assert [(s.frames, s.first_s) for s in found.lost()] == [(10, pytest.approx(40 / 30))]
+
+
+def test_frames_of_a_map_that_goes_on_behind_another_are_in_order_of_time(tmp_path: Path) -> None:
+    maps = np.repeat([0, 1, 0], 30).astype(np.int32)  # the third part was joined to the first
+    found = _odometry(_line(90, 0.05), maps=maps)
+    rows = choose_frames(found, SETTINGS)
+    write_chosen(found, rows, tmp_path / "chosen.tum")
+    times = read_trajectory(tmp_path / "chosen.tum").timestamps
+    assert times.tolist() == found.timestamps[rows].tolist()
+    assert np.bincount(maps[rows]).min() >= 10
 
 
 def test_maps_of_few_frames_and_maps_without_points_have_no_pose() -> None:

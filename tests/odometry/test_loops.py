@@ -25,7 +25,7 @@ def _followed(frames: Sequence[np.ndarray]) -> Odometry:
         return ((row, frames[row]) for row in rows)
 
     times = np.arange(len(frames)) / FPS
-    return track_panoramas(SmallPanoramas(Path("walk"), times, WIDTH, read))
+    return track_panoramas(SmallPanoramas(Path("walk"), times, WIDTH, read, ""))
 
 
 def _ate(found: Odometry, truth: np.ndarray) -> float:

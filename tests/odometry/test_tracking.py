@@ -4,12 +4,14 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from dense_walk import WIDTH, RenderedWalk
 
+from gsba.frames.scan import scan
 from gsba.odometry import walk
-from gsba.odometry.panoramas import SmallPanoramas
+from gsba.odometry.panoramas import SmallPanoramas, of_frames
 from gsba.odometry.walk import Tracking, track_frames
 
 BROKEN = 3  # the frame that cannot be read
@@ -28,7 +30,7 @@ def _panoramas(walk: RenderedWalk, folder: Path, stops: int | None = None) -> Sm
     usable = np.ones((WIDTH // 2, WIDTH), bool)
     usable[-WIDTH // 16 :] = False
     num = min(len(walk.frames), 24)
-    return SmallPanoramas(folder, np.arange(num) / 8.0, WIDTH, read, usable)
+    return SmallPanoramas(folder, np.arange(num) / 8.0, WIDTH, read, "", usable)
 
 
 @pytest.fixture
@@ -85,3 +87,25 @@ def test_a_checkpoint_of_something_else_is_not_used(
     checkpoint.write_bytes(checkpoint.read_bytes()[:-100])
     _assert_same(track_frames(_panoramas(walk, tmp_path), 0, checkpoint), whole)
     assert "tracking begins anew" in caplog.text
+
+
+@pytest.mark.usefixtures("always")
+def test_other_pictures_or_lenses_begin_anew(walk: RenderedWalk, tmp_path: Path) -> None:
+    """Pictures of a folder that were replaced meanwhile, and raw ones with another calibration."""
+    checkpoint, folder = tmp_path / "unfinished.npz", tmp_path / "frames"
+    folder.mkdir()
+
+    def write(mirrored: bool) -> SmallPanoramas:
+        for n, picture in enumerate(walk.frames[:12]):
+            cv2.imwrite(str(folder / f"{n:02d}.png"), picture[:, :: -1 if mirrored else 1])
+        return of_frames(scan(folder, fps=8), folder, WIDTH)
+
+    def interrupted(rows: Sequence[int], colour: bool) -> Iterator[tuple[int, np.ndarray]]:
+        yield from before.read(rows[:8], colour)
+        raise KeyboardInterrupt
+
+    before = write(mirrored=False)
+    with pytest.raises(KeyboardInterrupt):
+        track_frames(replace(before, read=interrupted), 0, checkpoint)
+    after = write(mirrored=True)
+    _assert_same(track_frames(after, 0, checkpoint), track_frames(after, 0, None))

@@ -14,6 +14,9 @@ from synthetic import loop_walk
 from two_fisheyes import made_pair, picture, write
 
 from gsba.config import RefineSettings
+from gsba.disk import write_image
+from gsba.masks import merging
+from gsba.masks.carrier import Carrier, no_carrier
 from gsba.pipeline.run import Run
 from gsba.store.store import RunStore, load_stage
 from gsba.types import CoarsePoses, FrameSet, PictureFormat
@@ -40,7 +43,7 @@ def test_a_pass_that_is_kept_is_kept_in_later_calls(
     monkeypatch.setattr(module.frontend, "extract", lambda run: run)
     monkeypatch.setattr(module, "solve", solved)
     monkeypatch.setattr(module.camera, "better_calibration", lambda *_: ((better, True),))
-    monkeypatch.setattr(module.merging, "recut", lambda _, frames, __: frames)
+    monkeypatch.setattr(module.merging, "recut", lambda _, frames, *__: frames)
     for _ in range(2):
         with RunStore(tmp_path / "run", {"frames": tmp_path}) as store:
             run = Run.begin(store, frames, coarse, RefineSettings())
@@ -49,3 +52,44 @@ def test_a_pass_that_is_kept_is_kept_in_later_calls(
             assert store.records["frames"].key == first
         assert load_stage(tmp_path / "run", "frames", FrameSet).format.fisheyes == pair
     assert found == [frames.format] * 3  # its features are stored again
+
+
+def test_the_carrier_of_each_recording_that_is_cut_anew_is_found_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In its new cut; masks of a camera that keeps its cut, and of frames without one, stay."""
+    seen: list[tuple[str, float]] = []
+
+    def find(frames: FrameSet) -> Carrier:
+        fisheyes = frames.format.fisheyes
+        assert fisheyes is not None
+        seen.append((frames.names[0], fisheyes[0].focal))
+        return replace(no_carrier(frames, ""), share=0.1)
+
+    monkeypatch.setattr(merging, "find_carrier", find)
+    pair = made_pair(64)
+    raw = PictureFormat("fisheye", 128, 64, fisheyes=pair)
+    better = (replace(pair[0], focal=1.1 * pair[0].focal), pair[1])
+    files = [write(tmp_path / f"{n}.png", picture(lens)) for n, lens in enumerate(pair)]
+    with RunStore(tmp_path / "run", {"frames": tmp_path}) as store:
+        masks = [store.root / "carrier@a.png", None, store.root / "carrier@c.png"]
+        for mask in filter(None, masks):
+            write_image(mask, np.full((64, 128), 255, np.uint8))
+        frames = replace(
+            frames_of(raw, [tuple(files)] * 6),
+            names=tuple(f"{name}/{f}" for name in "abc" for f in range(2)),
+            mask_paths=tuple(mask for mask in masks for _ in range(2)),
+            formats=(raw, raw),
+            camera_of_frame=(0, 0, 0, 0, 1, 1),
+            clock_shifts=(0.0, 0.0, 10.0, 10.0, 20.0, 20.0),
+        )
+        cut = frames.with_formats([replace(raw, fisheyes=better), raw])
+        for n in (1, 2):
+            cut = merging.recut(store, cut, n, [0])
+            assert [path and path.name for path in cut.mask_paths[::2]] == [
+                f"carrier{n}@a.png",
+                None,
+                "carrier@c.png",
+            ]
+            assert (store.root / f"carrier{n}@a.png").exists()
+    assert seen == [("a/0", better[0].focal)] * 2

@@ -1,21 +1,28 @@
 """More frames of a video where its map is weak, and datasets without them."""
 
+import importlib
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 from export_scene import panoramas, reconstruction
+from refusals import refused
 from video_files import encode, steady
 
 from gsba.bundle.map_strength import MapStrength
 from gsba.config import OdometrySettings, RefineSettings, VideoSettings
 from gsba.export import ExportFormat, export
 from gsba.frames.scan import scan
+from gsba.log import GsbaError
+from gsba.masks.merging import Choice, choose
 from gsba.odometry import Odometry
 from gsba.pipeline import densify
 from gsba.pipeline.prior import Prior
+from gsba.pipeline.run import Evidence
 from gsba.store.store import RunStore
 from gsba.trajectory.files import read_trajectory
 from gsba.trajectory.judgement import StepChecks
@@ -105,6 +112,33 @@ def test_frames_are_fetched_until_the_map_is_strong(video: Path, tmp_path: Path)
         assert asked == [5, 6] and again.names == found.names and again.paths == found.paths
         none = SETTINGS.model_copy(update={"odometry": OdometrySettings(fetch_rounds=0)})
         assert densify.fetch_where_weak(store, video, _walk(), chosen, none, measure) is chosen
+
+
+def test_where_the_map_is_weak_is_measured_again_under_other_masks(
+    video: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module, asked = importlib.import_module("gsba.pipeline.refine"), list[bool]()
+
+    def begin(store: RunStore, settings: RefineSettings, chosen: Choice, start: Any) -> FrameSet:
+        asked.append(chosen.carrier)
+        return start.frames
+
+    def far_enough(*given: object) -> None:
+        raise GsbaError("far enough")
+
+    monkeypatch.setattr(module, "compile_ahead", lambda *_: None)
+    monkeypatch.setattr(module, "_begin", begin)
+    monkeypatch.setattr(module.frontend, "extract", lambda frames: frames)
+    solved = SimpleNamespace(prior=_prior(5, []))
+    monkeypatch.setattr(module, "_map_features", lambda _: solved)
+    monkeypatch.setattr(module, "_in_order", far_enough)
+    extract(video, tmp_path / "frames", VideoSettings(fps=1))
+    start = module.Start.of(scan(tmp_path / "frames"), Evidence(), SETTINGS)
+    for masks in ("none", "auto", "auto"):
+        with RunStore(tmp_path / "run", {"frames": video}) as store:
+            given = store, SETTINGS, choose(masks), Evidence(), start, video, _walk()
+            refused("far enough", module.refine_from, *given)
+    assert asked == [False, True]
 
 
 def test_datasets_go_without_fetched_frames(tmp_path: Path) -> None:

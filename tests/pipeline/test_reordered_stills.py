@@ -82,7 +82,7 @@ def test_masks_of_a_first_solution_are_of_stills_in_the_order_given(
     """So that the search that follows judges the order given, not one that was found before."""
 
     def after(
-        store: RunStore, frames: FrameSet, solved: object, stage: str
+        store: RunStore, frames: FrameSet, choice: object, solved: object, stage: str
     ) -> tuple[FrameSet, Counts]:
         masks = tuple(tmp_path / f"{name}_mask.png" for name in frames.names)
         return replace(frames, mask_paths=masks), Counts(5, 5, "frames")
@@ -93,7 +93,8 @@ def test_masks_of_a_first_solution_are_of_stills_in_the_order_given(
     solved = SimpleNamespace(prior=SimpleNamespace(turning_only=False), solution=None)
     start = Start.of(stills, Evidence(), RefineSettings())
     with RunStore(tmp_path / "run", {"frames": tmp_path}) as store:
-        masked = _without_distractors(store, RefineSettings(), start, Journal())
+        chosen = merging.choose(merging.DISTRACTORS)
+        masked = _without_distractors(store, RefineSettings(), chosen, start, Journal())
     assert masked.names == NAMES and masked.timestamps.tolist() == stills.timestamps.tolist()
     assert masked.mask_paths == tuple(tmp_path / f"{name}_mask.png" for name in NAMES)
 

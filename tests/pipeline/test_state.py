@@ -7,11 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gsba.config import RefineSettings
+from gsba.config import CameraSettings, RefineSettings
+from gsba.pipeline.prior import Prior
 from gsba.pipeline.refine import _add_keypoints_where_weak
-from gsba.pipeline.state import MapMatches
+from gsba.pipeline.run import Evidence, RecordingEvidence, Run
+from gsba.pipeline.state import MapMatches, State
 from gsba.store.store import RunStore
-from gsba.types import Matches
+from gsba.types import CoarsePoses, FrameSet, Matches, PictureFormat, VerifiedPairs
 
 
 def _matches(*pairs: tuple[int, int]) -> Matches:
@@ -51,3 +53,35 @@ def test_features_of_weak_frames_go_where_no_frame_is_weak(prefix: str, tmp_path
         state: Any = SimpleNamespace(run=run, prior=prior, observed=SimpleNamespace(more=False))
         assert _add_keypoints_where_weak(state) is state
     assert [stage.exists() for stage in stages] == [prefix != "", prefix == ""]
+
+
+@pytest.mark.parametrize("of_b", [False, True])
+def test_frames_without_times_have_no_published_readout(of_b: bool, tmp_path: Path) -> None:
+    """Each of several cameras by its own frames: numbers of frames are no seconds."""
+    picture = tmp_path / "0.png"
+    picture.touch()
+    frames = FrameSet(
+        tuple(f"{'ab'[n > 1]}/{n}" for n in range(4)),
+        ((picture,),) * 4,
+        np.arange(4.0),
+        (None,) * 4,
+        (PictureFormat("erp", 64, 32),) * 2,
+        (0, 0, 1, 1),
+        clock_shifts=(0.0,) * 4,
+    ).with_timed((False, False, of_b, of_b))
+    start = CoarsePoses(np.tile(np.eye(4), (4, 1, 1)), np.zeros(4, np.uint8), 0.0)
+    given = zip("ab", ("insta360-x5", "dji-osmo-360"), strict=True)
+    recordings = tuple(
+        RecordingEvidence(name, start.taken(np.arange(2)), camera=CameraSettings(name=model))
+        for name, model in given
+    )
+    settings, evidence = RefineSettings(), Evidence(recordings=recordings)
+    with RunStore(tmp_path / "run", {"frames": tmp_path}) as store:
+        run = Run.begin(store, frames, start, settings, evidence)
+        nothing: Any = None
+        none = VerifiedPairs.none()
+        state = State(run, Prior.of(start), nothing, nothing, none, MapMatches(none.matches))
+        context = state.context_of_images(settings.priors)
+    cameras = [context.of_camera(number).settings.camera for number in range(2)]
+    assert [one.readout() is not None for one in cameras] == [False, of_b]
+    assert [(one.baseline() or (0.0,))[0] for one in cameras] == [0.032, 0.025]

@@ -129,6 +129,10 @@ def test_scale_by_the_distance_between_lenses() -> None:
     wrong = {
         "found no two lenses": (walk_result(), (0.032, 0.001)),
         "needs the distance between the lenses": (result, None),
+        "none has a known distance": (
+            dataclasses.replace(result, lens_baseline=(0.01, np.inf)),
+            (0.032, 0.001),
+        ),
         "a sigma of 20 %; less than 10 % is needed": (
             dataclasses.replace(result, lens_baseline=(0.01, 0.002)),
             (0.032, 0.0),

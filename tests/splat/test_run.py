@@ -77,8 +77,10 @@ def test_evaluate_compares_sources_and_resumes(case: Case, run: Path, tmp_path: 
     psnrs = [content[name]["mean"]["psnr"] for name in ("refined", "moved")]
     assert abs(psnrs[0] - psnrs[1]) < 0.01  # thirty steps: density control has yet to begin
     assert "moved" in table and len(list((run / "splat-evaluation/pictures").iterdir())) == 1
-    again = call(*arguments)
+    again = call(*arguments, "--json", tmp_path / "numbers.json")
     assert again == table
+    written = json.loads((tmp_path / "numbers.json").read_text())
+    assert written["splat"] == content
 
 
 def test_files_of_one_name_are_not_taken_for_one(run: Path, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import logging
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -10,9 +11,12 @@ import numpy as np
 import pytest
 from command import fails, run_gsba, succeed
 from refusals import refused
+from two_fisheyes import made_pair
 from video_files import Track, encode, interrupt, steady, times_of
 
+from gsba.camera.calibration import calibration_json
 from gsba.config import RefineSettings, VideoSettings
+from gsba.odometry import of_video
 from gsba.pipeline.inputs import extract_video
 from gsba.store.store import RunStore
 from gsba.video import extract, is_video, recording
@@ -220,6 +224,18 @@ def test_sharpness_is_that_of_both_lenses(tmp_path: Path) -> None:
     assert _read(tmp_path / "frames/front/000001.jpg") == ("front", 1)
     assert _read(tmp_path / "frames/back/000001.jpg") == ("back", 1)
     assert len(times_of(tmp_path / "frames")) == 1
+
+
+def test_tracking_goes_on_with_the_same_lenses_alone(tmp_path: Path) -> None:
+    """Checkpoints of odometry are of the lenses that the pictures are joined by."""
+    front, back = (_seen(lens, range(4), steady(4)) for lens in ("front", "back"))
+    video, found = encode(tmp_path / "v.mp4", front, back), []
+    for stretch in (1.0, 1.03, 1.0):
+        pair = tuple(replace(lens, focal=stretch * lens.focal) for lens in made_pair(SIDE))
+        calibration = tmp_path / "calibration.json"
+        calibration.write_text(json.dumps(calibration_json(pair, np.zeros(3), "m", {})))
+        found.append(of_video(video, calibration=calibration).contents)
+    assert found[0] == found[2] != found[1]
 
 
 def test_a_standing_camera_is_left_out(tmp_path: Path) -> None:

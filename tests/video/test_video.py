@@ -3,6 +3,8 @@
 import json
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -311,7 +313,8 @@ def test_a_black_video_is_refused_before_it_is_followed(
     assert done.exit_code == 1 and "its frames are black" in done.stderr, done.stderr
     chosen = "extract", video, "--out", tmp_path / "frames", "--every", "auto"
     fails(run_gsba(*chosen), "its frames are black")
-    monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty").mkdir()
+    monkeypatch.chdir(tmp_path / "empty")
     fails(run_gsba(*chosen[:3], ".", *chosen[4:]), "its frames are black")
     fails(run_gsba(*chosen, "--width", 512), f"--width 512: {video} has only {WIDTH} pixels")
     fails(run_gsba(*chosen, "--sharpest"), "--every auto keeps sharp frames already")
@@ -351,13 +354,57 @@ def test_times_for_a_video_are_refused(film: Path, tmp_path: Path) -> None:
     assert isinstance(found, Trajectory) and found.timestamps.tolist() == [0.0, 0.5]
 
 
-def test_fewer_frames_than_chosen_before_are_another_extraction(film: Path, tmp_path: Path) -> None:
-    at, out = tmp_path / "frames.tum", tmp_path / "frames"
-    write_tum(at, Trajectory(np.arange(5) / 4, np.tile(np.eye(4), (5, 1, 1))))
-    succeed("extract", film, "--out", out, "--at", at)
-    again = "extract", film, "--out", out, "--every", "auto", "--frames"
-    succeed(*again, 5)
-    fails(run_gsba(*again, 4), "frames holds more than 4 frames, chosen before")
+def _follow(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Odometry that finds five poses at once; gets its runs."""
+    runs: list[int] = []
+
+    def track_panoramas(video: object) -> Any:
+        runs.append(len(runs))
+        poses = np.tile(np.eye(4), (5, 1, 1))
+        return SimpleNamespace(timestamps=np.arange(5) / 4, world_T_rigs=poses, usable=lambda: True)
+
+    monkeypatch.setattr("gsba.odometry.of_video", lambda *_, **__: None)
+    monkeypatch.setattr("gsba.odometry.without_carrier", lambda _: None)
+    monkeypatch.setattr("gsba.odometry.track_panoramas", track_panoramas)
+    monkeypatch.setattr(
+        "gsba.odometry.choose_frames", lambda _, settings: np.arange(settings.max_frames or 5)
+    )
+    return runs
+
+
+def test_another_number_of_frames_is_another_extraction(
+    film: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """More, fewer, or all: not those that an earlier call chose."""
+    runs, out = _follow(monkeypatch), tmp_path / "frames"
+    auto = "extract", film, "--out", out, "--every", "auto"
+    for _ in range(2):
+        assert "4 of 90 frames kept" in succeed(*auto, "--frames", 4).output
+    for other in (("--frames", 3), ("--frames", 5), ()):
+        fails(run_gsba(*auto, *other), "frames holds frames that were chosen otherwise")
+    assert len(runs) == 1
+    assert "5 of 90 frames kept" in succeed(*auto, "--fresh").output
+    fails(run_gsba(*auto[:4], "--fps", 1), "holds another extraction")
+    succeed(*auto[:4], "--fps", 1, "--fresh")
+    fails(run_gsba(*auto), "frames holds frames that were chosen otherwise")
+    assert len(runs) == 2
+
+
+def test_poses_of_chosen_frames_replace_no_file_of_ones_own(
+    film: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As `gsba track walk.mp4 --out walk.tum` writes beside a folder `walk`."""
+    runs, out, own = _follow(monkeypatch), tmp_path / "walk", tmp_path / "walk.tum"
+    own.write_text("0 0 0 0 0 0 0 1\n")
+    auto = "extract", film, "--out", out, "--every", "auto"
+    for more in ((), ("--fresh",)):
+        fails(run_gsba(*auto, *more), "walk.tum: poses of the chosen frames would replace it")
+    assert own.read_text() == "0 0 0 0 0 0 0 1\n" and not out.exists()
+    own.unlink()
+    (out / "notes.txt").parent.mkdir()
+    (out / "notes.txt").touch()
+    fails(run_gsba(*auto), "walk is not empty and not an extraction")
+    assert not runs
 
 
 def test_missing_library_is_one_line(
