@@ -1,6 +1,7 @@
 """Frames from videos made here: which, when, how sharp, resumed, and what is refused."""
 
 import json
+from fractions import Fraction
 from functools import cache
 from pathlib import Path
 
@@ -87,6 +88,28 @@ def test_times_are_those_of_presentation(tmp_path: Path, suffix: str, codec: str
     frames = scan(tmp_path / "frames")
     np.testing.assert_array_equal(frames.timestamps, list(times.values()))
     assert (frames.format.width, frames.format.height) == (WIDTH, HEIGHT)
+
+
+@pytest.mark.parametrize(("codec", "reorders"), [("libx264", True), ("mpeg4", False)])
+def test_times_of_the_stored_order_are_refused(tmp_path: Path, codec: str, reorders: bool) -> None:
+    """As of H.264 with B-frames in AVI, which would give pictures the times of others."""
+    video = tmp_path / "walk.avi"
+    with av.open(str(video), "w") as container:
+        stream = container.add_stream(codec, rate=30)
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+        stream.codec_context.max_b_frames = 2
+        for index in range(30):
+            frame = av.VideoFrame.from_ndarray(_picture(index, 2 * index), format="rgb24")
+            frame.pts, frame.time_base = index, Fraction(1, 30)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    if reorders:
+        refused(
+            r"walk\.avi: it states times.*stored", extract, video, tmp_path / "no", VideoSettings()
+        )
+        return
+    extract(video, tmp_path / "frames", VideoSettings(every=7))
+    assert _indices(tmp_path / "frames") == [0, 7, 14, 21, 28]
 
 
 def test_one_frame_a_second_and_the_sharpest_of_it(film: Path, tmp_path: Path) -> None:
