@@ -5,7 +5,7 @@ read these files like given masks.
 """
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -48,7 +48,27 @@ class Choice:
     distractors: bool
     segment: Segment | None
     carrier_required: bool = False  # True if an undetectable carrier is an error
-    without_carrier: tuple[str, ...] = ()  # of several recordings, those whose carrier stays
+    # Of several recordings, those whose carrier stays, those for which it is no error that it
+    # cannot be detected, and those whose distractors stay.
+    without_carrier: tuple[str, ...] = ()
+    carrier_optional: tuple[str, ...] = ()
+    without_distractors: tuple[str, ...] = ()
+
+    @classmethod
+    def of_recordings(cls, choices: Mapping[str, "Choice"], segment: Segment | None) -> "Choice":
+        """The choice of several recordings together, by the name of each; their files are theirs
+        alone."""
+        every = choices.values()
+        return cls(
+            None,
+            any(one.carrier for one in every),
+            any(one.distractors for one in every),
+            segment,
+            any(one.carrier_required for one in every),
+            tuple(name for name, one in choices.items() if not one.carrier),
+            tuple(name for name, one in choices.items() if not one.carrier_required),
+            tuple(name for name, one in choices.items() if not one.distractors),
+        )
 
 
 def choose(masks: Masks, segment: Segment | None = None) -> Choice:
@@ -81,10 +101,9 @@ def before(store: RunStore, frames: FrameSet, choice: Choice) -> FrameSet:
         found = segmented(store, frames, choice.segment)
         parts.append(lambda f: load_segmented(found, frames, f))
         names.append("segmented")
-    if choice.carrier or padded(frames):
-        for name, mask in _borders(store, frames).items():
-            parts.append(mask)
-            names.append(name)
+    for name, mask in _borders(store, frames, choice).items():
+        parts.append(mask)
+        names.append(name)
     if choice.carrier:
         frames, more, stages = _carriers(store, frames, choice, alone=not parts)
         parts += more
@@ -96,11 +115,16 @@ def before(store: RunStore, frames: FrameSet, choice: Choice) -> FrameSet:
     return _merge(store, folder, frames, parts, names)
 
 
-def _borders(store: RunStore, frames: FrameSet) -> dict[str, Callable[[int], np.ndarray | None]]:
-    """Masks of areas that are black in all frames of a recording, by the name of their stage."""
+def _borders(
+    store: RunStore, frames: FrameSet, choice: Choice
+) -> dict[str, Callable[[int], np.ndarray | None]]:
+    """Masks of areas that are black in all frames of a recording, where they are looked for or are
+    its padding, by the name of their stage."""
     parts: dict[str, Callable[[int], np.ndarray | None]] = {}
     for name, rows in (frames.recordings or {"": np.arange(len(frames))}).items():
         own = frames.taken(rows) if frames.recordings else frames
+        if not (choice.carrier and name not in choice.without_carrier) and not padded(own):
+            continue
         found = find_borders(own)
         if not found.share:
             continue
@@ -123,7 +147,8 @@ def _carriers(
     for name, rows in recordings.items():
         if name not in choice.without_carrier:
             own = frames.taken(rows) if frames.recordings else frames
-            carrier = _carrier(store, own, choice.carrier_required, stages[name])
+            required = choice.carrier_required and name not in choice.carrier_optional
+            carrier = _carrier(store, own, required, stages[name])
             if carrier.share:
                 found[name] = carrier
     turning = any(carrier.turns.any() for carrier in found.values())
@@ -143,11 +168,15 @@ def _carriers(
 
 
 def after(
-    store: RunStore, frames: FrameSet, solved: Solution, stage: str
+    store: RunStore,
+    frames: FrameSet,
+    solved: Solution,
+    stage: str,
+    without: Sequence[str] = (),
 ) -> tuple[FrameSet, Counts]:
     """Frames with masks of pixels that no static scene explains, by a first solution and its stage.
     Distractors are searched twice: the second pass does not compare pixels that the first one
-    marked in other frames."""
+    marked in other frames. Recordings `without` keep the masks that they have."""
     items = dict.fromkeys(frames.names)
 
     def look(name: str, before: PerFrame[Distractors] | None) -> PerFrame[Distractors]:
@@ -159,13 +188,15 @@ def after(
 
     found = look("distractors", look("distractors1", None))
     results = [found[name] for name in frames.names]
-    parts = [lambda f: distractor_weights(results[f])]
-    merged = _merge(store, store.root / _FOLDER, frames, parts, ["distractors"])
-    shares = np.array([one.share for one in results])
+    masked = [name.rpartition("/")[0] not in without for name in frames.names]
+    parts = [lambda f: distractor_weights(results[f]) if masked[f] else None]
+    merged = _merge(store, store.root / _FOLDER, frames, parts, ["distractors"], without)
+    shares = np.array([one.share for one in results])[masked]
     check = store.root / "masks_check.jpg"
     if not (check.exists() and store.records["masks"].resumed):
         rows = []
-        for row in np.sort(np.argsort(-shares, kind="stable")[:_NUM_CHECK_FRAMES]):
+        most = np.argsort(-shares, kind="stable")[:_NUM_CHECK_FRAMES]
+        for row in np.sort(np.flatnonzero(masked)[most]):
             size = (_CHECK_WIDTH_PX, _CHECK_WIDTH_PX // 2)
             if merged.format_of(int(row)).panoramic:
                 shown = cv2.resize(load_erp(merged, int(row), width=_CHECK_WIDTH_PX), size)
@@ -230,9 +261,11 @@ def _merge(
     frames: FrameSet,
     parts: Sequence[Callable[[int], np.ndarray | None]],
     stages: Sequence[str],
+    without: Sequence[str] = (),
 ) -> FrameSet:
-    """Frames with masks `folder`/NAME.png of own masks and all parts ((h, 2h) bool, weights, None);
-    an unchanged file keeps its time, so that stages that depend on it resume."""
+    """Frames with masks `folder`/NAME.png of own masks and all parts ((h, 2h) bool, weights, None),
+    which are None for recordings `without`; an unchanged file keeps its time, so that stages that
+    depend on it resume."""
     paths = [folder / f"{name}.png" for name in frames.names]
 
     def compute() -> Counts:
@@ -256,7 +289,7 @@ def _merge(
     if not all(path.exists() for path in paths):
         store.forget(name)
     shapes = [(kind.width, kind.layout) for kind in frames.formats]
-    inputs = fingerprint(frames.mask_paths), shapes, frames.camera_of_frame
+    inputs = fingerprint(frames.mask_paths), shapes, frames.camera_of_frame, *without
     store.stage(name, inputs, compute, Counts, stages)
     if name == "masks":
         store.claim(folder)

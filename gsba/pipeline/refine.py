@@ -178,15 +178,7 @@ def refine_each(
     check(settings.placement, baseline=settings.camera.baseline())
     # Sources of masks of all recordings; files belong to each recording alone.
     choices = {one.name: merging.choose(one.recording.masks, segment) for one in given}
-    every = list(choices.values())
-    chosen = merging.Choice(
-        None,
-        any(one.carrier for one in every),
-        any(one.distractors for one in every),
-        segment,
-        any(one.carrier_required for one in every),
-        tuple(name for name, one in choices.items() if not one.carrier),
-    )
+    chosen = merging.Choice.of_recordings(choices, segment)
     origin = {name: path for one in given for name, path in one.files.items()}
     given, fresh, extracted = with_videos(given, out, origin, settings, fresh)
     found = {one.name: one.scanned() for one in given}
@@ -317,16 +309,21 @@ def _begin(store: RunStore, settings: RefineSettings, chosen: merging.Choice, st
     tell_size(settings, start.frames, width, given)
     journal, frames = Journal(), merging.before(store, start.frames, chosen)
     if chosen.distractors:
-        frames = _without_distractors(store, settings, start.on(frames, settings), journal)
+        left = chosen.without_distractors
+        frames = _without_distractors(store, settings, start.on(frames, settings), journal, left)
     start = start.on(tour.in_known_order(store, frames, settings), settings)
     return Run.begin(store, start.frames, start.coarse, settings, start.evidence, journal)
 
 
 def _without_distractors(
-    store: RunStore, settings: RefineSettings, start: Start, journal: Journal
+    store: RunStore,
+    settings: RefineSettings,
+    start: Start,
+    journal: Journal,
+    left: Sequence[str],
 ) -> FrameSet:
     """The frames, in the order given, with masks of what a first, plainer solution does not
-    explain."""
+    explain, but for recordings that are left as they are."""
     plainer = settings.plainer()
     direct.check(start.frames, settings)  # before the first solution, not after
 
@@ -342,7 +339,7 @@ def _without_distractors(
     if state.prior.turning_only:
         return start.frames
     first = f"first-{run.latest[0]}"
-    masked, counts = merging.after(store, run.frames, state.solution, first)
+    masked, counts = merging.after(store, run.frames, state.solution, first, left)
     journal.note("distractors", counts)
     masks = dict(zip(masked.names, masked.mask_paths, strict=True))
     return replace(start.frames, mask_paths=tuple(masks[name] for name in start.frames.names))

@@ -1,0 +1,83 @@
+"""Each of several recordings has the masks that were asked for it, and no others."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from plain_records import frames_of
+from two_fisheyes import write
+
+from gsba.frames.masks import load_mask
+from gsba.frames.recordings import combine
+from gsba.log import GsbaError
+from gsba.masks import merging
+from gsba.masks.carrier import Carrier, no_carrier
+from gsba.masks.distractors import Distractors
+from gsba.masks.merging import Choice, choose
+from gsba.store.store import RunStore
+from gsba.types import FrameSet, PictureFormat, Solution
+
+SIZE, NUM = (256, 512), 3
+
+
+@pytest.fixture
+def frames(tmp_path: Path) -> FrameSet:
+    """Two recordings of panoramas that are black below."""
+    rng = np.random.default_rng(0)
+    recordings = {}
+    for name in "ab":
+        files = list[tuple[Path]]()
+        for n in range(NUM):
+            picture = rng.integers(60, 200, (*SIZE, 3), np.uint8)
+            picture[200:] = 0
+            files.append((write(tmp_path / f"{name}{n}.png", picture),))
+        recordings[name] = frames_of(PictureFormat("erp", *SIZE[::-1]), files)
+    return combine(recordings)
+
+
+def _masked(frames: FrameSet) -> list[bool]:
+    """Whether pixels of each frame are masked."""
+    masks = [load_mask(frames, f) for f in range(len(frames))]
+    return [mask is not None and not mask.all() for mask in masks]
+
+
+def test_borders_are_those_of_recordings_that_ask_for_masks(
+    frames: FrameSet, tmp_path: Path
+) -> None:
+    chosen = Choice.of_recordings({"a": choose("auto"), "b": choose("none")}, None)
+    with RunStore(tmp_path / "run", {"frames": tmp_path}) as store:
+        found = merging.before(store, frames, chosen)
+    assert _masked(found) == [True] * NUM + [False] * NUM
+
+
+def test_a_carrier_is_required_of_recordings_that_say_so(
+    frames: FrameSet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def find(own: FrameSet) -> Carrier:
+        if own.names[0].startswith("b/"):
+            raise GsbaError("the camera must move to detect its carrier")
+        return no_carrier(own, "nothing turns with the camera")
+
+    monkeypatch.setattr(merging, "find_carrier", find)
+    with RunStore(tmp_path / "run", {"frames": tmp_path}) as store:
+        asked = {"a": choose("carrier"), "b": choose("auto")}
+        merging.before(store, frames, Choice.of_recordings(asked, None))
+        asked = {"a": choose("auto"), "b": choose("carrier")}
+        with pytest.raises(GsbaError, match="must move"):
+            merging.before(store, frames, Choice.of_recordings(asked, None))
+
+
+def test_distractors_are_those_of_recordings_that_ask_for_them(
+    frames: FrameSet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    everything = cv2.imencode(".png", np.zeros(SIZE, np.uint8))[1].ravel()
+    monkeypatch.setattr(merging, "Look", lambda *_: lambda _: Distractors(everything, 1.0, ""))
+    asked = {"a": choose("none"), "b": choose("distractors")}
+    chosen = Choice.of_recordings(asked, None)
+    solved = Solution.without_points(np.tile(np.eye(4), (len(frames), 1, 1)))
+    with RunStore(tmp_path / "run", {"frames": tmp_path}) as store:
+        for without in (chosen.without_distractors, ()):
+            store.stage("solved", None, lambda: True, bool)
+            found, _ = merging.after(store, frames, solved, "solved", without)
+            assert _masked(found) == [not without] * NUM + [True] * NUM
