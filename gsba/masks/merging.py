@@ -162,7 +162,7 @@ def _carriers(
         name = frames.names[f].rpartition("/")[0]
         if name not in found:
             return None
-        return carrier_mask(found[name], frames, f - first[name])
+        return carrier_mask(found[name], frames.format_of(f), f - first[name])
 
     return frames, [part] if found else [], [stages[name] for name in found]
 

@@ -1,5 +1,6 @@
 """Each of several recordings has the masks that were asked for it, and no others."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -16,7 +17,7 @@ from gsba.masks.carrier import Carrier, no_carrier
 from gsba.masks.distractors import Distractors
 from gsba.masks.merging import Choice, choose
 from gsba.store.store import RunStore
-from gsba.types import FrameSet, PictureFormat, Solution
+from gsba.types import FACES, FrameSet, PictureFormat, Solution
 
 SIZE, NUM = (256, 512), 3
 
@@ -81,3 +82,34 @@ def test_distractors_are_those_of_recordings_that_ask_for_them(
             store.stage("solved", None, lambda: True, bool)
             found, _ = merging.after(store, frames, solved, "solved", without)
             assert _masked(found) == [not without] * NUM + [True] * NUM
+
+
+def test_a_carrier_is_masked_in_pictures_of_its_own_camera(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not in those of the first camera, whose faces are as wide as its panoramas."""
+    rng, side = np.random.default_rng(0), SIZE[1]
+    square = write(tmp_path / "face.png", rng.integers(60, 200, (side, side, 3), np.uint8))
+    panorama = write(tmp_path / "panorama.png", rng.integers(60, 200, (*SIZE, 3), np.uint8))
+    recordings = {
+        "a": frames_of(PictureFormat("cube", side, side, FACES), [(square,) * 6] * NUM),
+        "b": frames_of(PictureFormat("erp", *SIZE[::-1]), [(panorama,)] * NUM),
+    }
+    turns = np.deg2rad([0.0, 90.0, 180.0])
+
+    def find(own: FrameSet) -> Carrier:
+        found = no_carrier(own, "")
+        if own.format.panoramic:
+            found.mask[200:, 100:120] = False
+            found = replace(found, turns=turns, share=0.01)
+        return found
+
+    monkeypatch.setattr(merging, "find_carrier", find)
+    asked = {"a": choose("none"), "b": choose("carrier")}
+    frames = combine(recordings)
+    with RunStore(tmp_path / "run", {"frames": tmp_path}) as store:
+        found = merging.before(store, frames, Choice.of_recordings(asked, None))
+    for f, turn in zip(range(NUM, 2 * NUM), turns, strict=True):
+        rows, columns = np.nonzero(~load_mask(found, f))
+        shift = round(side * turn / (2 * np.pi))
+        assert rows.min() == 200 and {*columns} == {*range(100 + shift, 120 + shift)}
