@@ -228,6 +228,17 @@ def test_edited_extractions_are_refused(
     refused(message, extract, film, out, settings)
 
 
+@pytest.mark.parametrize("gone", ["timestamps.csv", "000030.jpg"])
+def test_what_an_extraction_lacks_is_made_again(film: Path, tmp_path: Path, gone: str) -> None:
+    """Frames without their table would have no times, or those of another rate."""
+    out = tmp_path / "frames"
+    extract(film, out, VideoSettings(every=30))
+    whole = {path.name: path.read_bytes() for path in out.iterdir()}
+    (out / gone).unlink()
+    extract(film, out, VideoSettings(every=30))
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == whole
+
+
 def test_colours_survive(tmp_path: Path) -> None:
     """What names no colour matrix is taken for BT.709; flat colours come back within JPEG's."""
     flat = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
