@@ -142,7 +142,7 @@ def _carriers(
 ) -> tuple[FrameSet, list[Callable[[int], np.ndarray | None]], list[str]]:
     """Frames with the mask of each recording's carrier, or else parts of masks and their stages."""
     recordings = frames.recordings or {"": np.arange(len(frames))}
-    stages = {name: f"carrier@{name}" if name else "carrier" for name in recordings}
+    stages = {name: _carrier_stage(name) for name in recordings}
     found: dict[str, Carrier] = {}
     for name, rows in recordings.items():
         if name not in choice.without_carrier:
@@ -221,13 +221,24 @@ def after(
 
 def recut(store: RunStore, frames: FrameSet, cut: int) -> FrameSet:
     """Raw pairs, with masks of an earlier cut, cut anew by a better calibration, the `cut`-th from
-    1, with the carrier detected again. Masks of anything else are kept."""
-    earlier = ["carrier.png", *(f"carrier{n}.png" for n in range(1, cut))]
-    if not set(frames.mask_paths) <= {store.root / name for name in earlier}:
-        return frames
-    carrier = _carrier(store, frames, False, f"carrier{cut}")
-    path = store.root / f"carrier{cut}.png" if carrier.share else None
-    return replace(frames, mask_paths=(path,) * len(frames))
+    1, with the carrier of each recording detected again. Masks of anything else are kept."""
+    masks = list(frames.mask_paths)
+    for name, rows in (frames.recordings or {"": np.arange(len(frames))}).items():
+        own = frames.taken(rows) if frames.recordings else frames
+        earlier = {store.root / f"{_carrier_stage(name, n)}.png" for n in range(cut)}
+        if own.format.fisheyes is None or not {*own.mask_paths} <= earlier:
+            continue
+        stage = _carrier_stage(name, cut)
+        carrier = _carrier(store, own, False, stage)
+        for row in rows.tolist():
+            masks[row] = store.root / f"{stage}.png" if carrier.share else None
+    return replace(frames, mask_paths=tuple(masks))
+
+
+def _carrier_stage(recording: str, cut: int = 0) -> str:
+    """Name of the stage that detects the carrier of a recording, "" = the only one, in frames of
+    the `cut`-th cut."""
+    return f"carrier{cut or ''}{recording and '@'}{recording}"
 
 
 def _carrier(store: RunStore, frames: FrameSet, required: bool, name: str) -> Carrier:
