@@ -64,12 +64,17 @@ def _chosen_by_odometry(
     from gsba.config_file import validated
     from gsba.disk import with_own_name
     from gsba.frames.files import EXTRACTED
-    from gsba.odometry.walk import write_chosen
+    from gsba.odometry.walk import is_chosen, write_chosen
     from gsba.trajectory.files import read_trajectory
     from gsba.video import check_video
 
     named = with_own_name(out)
     path = named.with_name(f"{named.name}.tum")
+    if path.exists() and not is_chosen(path):
+        raise GsbaError(
+            f"{path}: the poses of the frames that odometry chooses go there, and it is another "
+            "file: move it, or choose another --out"
+        )
     if path.is_file() and (out / EXTRACTED).is_file() and not fresh:  # chosen before
         if frames is not None and len(read_trajectory(path).timestamps) > frames:
             raise GsbaError(

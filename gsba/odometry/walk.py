@@ -376,6 +376,18 @@ def write_odometry(found: Odometry, walk: Path, keyframes: Path, poses: Path, re
     write_tum(walk, found.trajectory())
 
 
+_CHOSEN = "frames chosen by gsba's odometry"  # first line of their file
+
+
+def is_chosen(path: Path) -> bool:
+    """True if a file was written by `write_chosen`."""
+    try:
+        with path.open("rb") as file:
+            return file.readline(64) == f"# {_CHOSEN}\n".encode()
+    except OSError:
+        return False
+
+
 def write_chosen(found: Odometry, rows: np.ndarray, path: Path) -> None:
     """Write the poses of chosen frames (N,) as a TUM file, whose times select them for extraction.
 
@@ -390,7 +402,7 @@ def write_chosen(found: Odometry, rows: np.ndarray, path: Path) -> None:
             if same and np.allclose(*poses, rtol=0, atol=1e-12):  # to the file's precision
                 return
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_tum(path, chosen)
+    write_tum(path, chosen, _CHOSEN)
 
 
 MAX_TURN_DEG = 40.0  # rotation between successive chosen frames: doorways and turns keep frames

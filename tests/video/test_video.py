@@ -387,11 +387,26 @@ def test_times_for_a_video_are_refused(film: Path, tmp_path: Path) -> None:
 
 def test_fewer_frames_than_chosen_before_are_another_extraction(film: Path, tmp_path: Path) -> None:
     at, out = tmp_path / "frames.tum", tmp_path / "frames"
-    write_tum(at, Trajectory(np.arange(5) / 4, np.tile(np.eye(4), (5, 1, 1))))
+    chosen = Trajectory(np.arange(5) / 4, np.tile(np.eye(4), (5, 1, 1)))
+    write_tum(at, chosen, "frames chosen by gsba's odometry")
     succeed("extract", film, "--out", out, "--at", at)
     again = "extract", film, "--out", out, "--every", "auto", "--frames"
     succeed(*again, 5)
     fails(run_gsba(*again, 4), "frames holds more than 4 frames, chosen before")
+
+
+@pytest.mark.parametrize("more", [(), ("--fresh",)])
+def test_chosen_frames_do_not_replace_a_trajectory(
+    film: Path, tmp_path: Path, more: tuple[str, ...]
+) -> None:
+    """Of the name of the folder, as documented for recordings and their trajectories."""
+    own, out = tmp_path / "walk.tum", tmp_path / "walk"
+    write_tum(own, Trajectory(np.arange(5) / 4, np.tile(np.eye(4), (5, 1, 1))))
+    before = own.read_bytes()
+    succeed("extract", film, "--out", out, "--at", own)
+    done = run_gsba("extract", film, "--out", out, "--every", "auto", *more)
+    fails(done, "walk.tum: the poses of the frames that odometry chooses go there")
+    assert own.read_bytes() == before
 
 
 def test_missing_library_is_one_line(
