@@ -42,9 +42,7 @@ def naming_recording(name: str) -> Iterator[None]:
     try:
         yield
     except GsbaError as error:
-        if name:
-            error.args = (f"recording '{name}': {error}",)
-        raise
+        raise error.within(f"recording '{name}'") if name else error
 
 
 def _match(state: State, number: int) -> State:
