@@ -22,10 +22,9 @@ EVENTS = "GSBA_EVENTS"  # environment variable that names the file of events
 class GsbaError(Exception):
     """Input or setting that cannot be used: one line with the problem, its place and the remedy."""
 
-    def within(self, place: str) -> "GsbaError":
-        """This error, of its kind, its line begun with a place."""
+    def begin_with(self, place: str) -> None:
+        """Put a place before the line."""
         self.args = (f"{place}: {self}",)
-        return self
 
 
 class StoppedError(GsbaError):

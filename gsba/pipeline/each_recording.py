@@ -42,7 +42,9 @@ def naming_recording(name: str) -> Iterator[None]:
     try:
         yield
     except GsbaError as error:
-        raise error.within(f"recording '{name}'") if name else error
+        if name:
+            error.begin_with(f"recording '{name}'")
+        raise
 
 
 def _match(state: State, number: int) -> State:
