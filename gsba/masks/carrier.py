@@ -155,21 +155,19 @@ def marked(picture: np.ndarray, places: np.ndarray) -> np.ndarray:
     return shown
 
 
-def write_carrier(
-    carrier: Carrier, frames: FrameSet, out: Path, merge: bool = True, name: str = "carrier"
-) -> list[Path]:
+def write_carrier(carrier: Carrier, frames: FrameSet, out: Path) -> list[Path]:
     """Write the carrier's mask, and a picture to check it; returns the files.
 
-    `NAME.png` is the mask (white = use), `NAME_check.jpg` the median picture with the outline. If
-    the frames have masks of their own, or the carrier turns, `merged/FRAME.png` combines the masks
-    of each frame, unless `merge` is False.
+    `carrier.png` is the mask (white = use), `carrier_check.jpg` the median picture with the
+    outline. If the frames have masks of their own, or the carrier turns, `merged/FRAME.png`
+    combines the masks of each frame.
     """
-    written = [out / f"{name}.png", out / f"{name}_check.jpg"]
+    written = [out / "carrier.png", out / "carrier_check.jpg"]
     write_image(written[0], carrier_mask(carrier, frames.format, 0).astype(np.uint8) * 255)
     write_image(written[1], marked(carrier.median, ~carrier.mask), jpeg_quality=88)
     for f, frame in enumerate(frames.names):
         own = load_mask(frames, f)
-        if merge and (own is not None or carrier.turns.any()):
+        if own is not None or carrier.turns.any():
             found = carrier_mask(carrier, frames.format, f)
             written.append(out / "merged" / f"{frame}.png")
             union = found if own is None else own & found

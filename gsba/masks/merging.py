@@ -12,19 +12,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from gsba.disk import write_bytes, write_image
+from gsba.disk import encoded_image, write_bytes, write_image
 from gsba.frames.masks import levels_of, load_mask, load_weights
 from gsba.frames.pixels import load_erp
 from gsba.log import GsbaError, track
 from gsba.masks.borders import Borders, find_borders, padded
-from gsba.masks.carrier import (
-    Carrier,
-    carrier_mask,
-    find_carrier,
-    marked,
-    no_carrier,
-    write_carrier,
-)
+from gsba.masks.carrier import Carrier, carrier_mask, find_carrier, marked, no_carrier
 from gsba.masks.distractors import Distractors, KnownMasks, Look, StaticScene, distractor_weights
 from gsba.masks.segmentation import Segment, load_segmented, segmented
 from gsba.store.store import PerFrame, RunStore, fingerprint
@@ -257,11 +250,14 @@ def _carrier(store: RunStore, frames: FrameSet, required: bool, name: str) -> Ca
     found = store.stage(name, (files, frames.format.fisheyes, required), compute, Carrier)
     if not found.share:
         return found
-    path = store.root / f"{name}.png"
-    if not (path.exists() and store.records[name].resumed):  # a new file would invalidate all
-        # stages
-        write_carrier(found, frames, store.root, merge=False, name=name)
-    for written in (path, store.root / f"{name}_check.jpg"):
+    path, check = store.root / f"{name}.png", store.root / f"{name}_check.jpg"
+    mask = encoded_image(carrier_mask(found, frames.format, 0).astype(np.uint8) * 255, path)
+    known = path.exists() and path.read_bytes() == mask
+    if not known:  # a new file would invalidate all stages
+        write_bytes(path, mask)
+    if not (known and check.exists() and store.records[name].resumed):
+        write_image(check, marked(found.median, ~found.mask), jpeg_quality=88)
+    for written in (path, check):
         store.claim(written)
     return found
 

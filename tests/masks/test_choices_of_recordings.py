@@ -13,6 +13,7 @@ from gsba.frames.masks import load_mask
 from gsba.frames.recordings import combine
 from gsba.log import GsbaError
 from gsba.masks import merging
+from gsba.masks.borders import Borders
 from gsba.masks.carrier import Carrier, no_carrier
 from gsba.masks.distractors import Distractors
 from gsba.masks.merging import Choice, choose
@@ -82,6 +83,36 @@ def test_distractors_are_those_of_recordings_that_ask_for_them(
             store.stage("solved", None, lambda: True, bool)
             found, _ = merging.after(store, frames, solved, "solved", without)
             assert _masked(found) == [not without] * NUM + [True] * NUM
+
+
+def test_a_call_that_was_killed_leaves_no_mask_of_earlier_frames(
+    frames: FrameSet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It had stored the carrier of other frames, but not yet written their mask."""
+    first = frames.paths[0]
+
+    def find(own: FrameSet) -> Carrier:
+        found = no_carrier(own, "")
+        found.mask[100:, : 40 if own.paths[0] == first else 80] = False
+        return replace(found, share=0.1)
+
+    def masked(rows: range) -> int:
+        own = frames_of(frames.format, [frames.paths[f] for f in rows])
+        with RunStore(tmp_path / "run", {"frames": tmp_path}) as store:
+            mask = load_mask(merging.before(store, own, choose("auto")), 0)
+        return np.count_nonzero(~mask[150])
+
+    monkeypatch.setattr(merging, "find_carrier", find)
+    monkeypatch.setattr(merging, "find_borders", lambda _: Borders(np.ones(SIZE, bool), 0.0))
+    files = [tmp_path / "run" / name for name in ("carrier.png", "carrier_check.jpg")]
+    narrow = masked(range(NUM))
+    earlier = [file.read_bytes() for file in files]
+    wide = masked(range(NUM, 2 * NUM))
+    later = [file.read_bytes() for file in files]
+    for file, content in zip(files, earlier, strict=True):
+        file.write_bytes(content)
+    assert narrow < wide == masked(range(NUM, 2 * NUM))
+    assert [file.read_bytes() for file in files] == later
 
 
 def test_a_carrier_is_masked_in_pictures_of_its_own_camera(
