@@ -22,6 +22,10 @@ EVENTS = "GSBA_EVENTS"  # environment variable that names the file of events
 class GsbaError(Exception):
     """Input or setting that cannot be used: one line with the problem, its place and the remedy."""
 
+    def begin_with(self, place: str) -> None:
+        """Put a place before the line."""
+        self.args = (f"{place}: {self}",)
+
 
 class StoppedError(GsbaError):
     """Work that an outside cause ended, and that resumes when it is run again."""

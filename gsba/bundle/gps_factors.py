@@ -309,10 +309,15 @@ class GpsFactors(Family):
         """Used and false fixes, and their residuals in metres."""
         fixes, poses = self.fixes, snapshot.world_T_rigs
         anchors = self._anchors(snapshot)
-        content: dict[str, Any] = {"fixes": len(fixes), "taken": anchors is not None}
+        of_fix = snapshot.maps[fixes.frames]
+        content: dict[str, Any] = {
+            "fixes": len(fixes),
+            "taken": anchors is not None,
+            "too_few_in_each_map": bool(np.bincount(of_fix, minlength=1).max() < MIN_FIXES),
+        }
         if anchors is None:
             return content | {"used": 0, "contradicted": self.contradicted}
-        used = np.flatnonzero(anchors.used)
+        used, judged = np.flatnonzero(anchors.used), np.isin(of_fix, [*anchors.level_from_map])
         off = np.empty((len(used), 3))
         for number, fit in anchors.level_from_map.items():
             inside = anchors.maps == number
@@ -321,7 +326,8 @@ class GpsFactors(Family):
         lengths = np.linalg.norm(off, axis=1)
         return content | {
             "used": len(used),
-            "false_fixes": [snapshot.names[f] for f in fixes.frames[~anchors.used]],
+            "false_fixes": [snapshot.names[f] for f in fixes.frames[judged & ~anchors.used]],
+            "fixes_elsewhere": int(np.count_nonzero(~judged)),  # of maps that they do not place
             "residual_m": {"median": np.median(lengths), "most": lengths.max()},
             "rms_m_east_north_up": np.sqrt(np.mean(off**2, axis=0)),
             "sigma_m_east_north_up": np.median(fixes.sigmas, axis=0),

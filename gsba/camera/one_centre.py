@@ -59,6 +59,8 @@ class Stitcher:
             joined = np.zeros((*rays.shape[:2], channels), np.float32)
             for lens, share in enumerate(self._weights(rays)):
                 columns = np.flatnonzero((share > 0).any(axis=0))
+                if not len(columns):  # a lens that looks up shows nothing of the rows below
+                    continue
                 scale = _DEPTH_GRID_WIDTH / width
                 places = np.meshgrid(columns + 0.5, np.arange(rows.start, rows.stop) + 0.5)
                 across, down = ((at * scale - 0.5 + PAD).astype(np.float32) for at in places)

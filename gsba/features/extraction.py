@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -113,11 +113,14 @@ def extract(
 
     compute = search.job(index, known)
     inputs = {
-        frame: fingerprint([*frames.paths[f], frames.mask_paths[f]]) for frame, f in index.items()
+        frame: (
+            fingerprint([*frames.paths[f], frames.mask_paths[f]]),
+            frames.format_of(f).fisheyes,  # of its own camera, by which it is cut
+        )
+        for frame, f in index.items()
     }
     relevant = chosen.model_dump(exclude={"weights", "accept_noncommercial", "download"})
-    cut = [[list(map(asdict, kind.fisheyes or ())) for kind in frames.formats], rig]
-    key = [settings.cubemap, relevant, fingerprint(files), *cut]
+    key = [settings.cubemap, relevant, fingerprint(files), rig]
     with freed_memory_kept():
         return store.per_frame(name, key, inputs, compute, Features)
 

@@ -206,8 +206,10 @@ def _orientation_trajectory(
     turned = readings.turned(sensor)
     # s: rotation is uniform in between
     every = max(int(0.004 / float(np.median(np.diff(readings.timestamps)))), 1)
-    turned = turned[::every] if axes is None else axes @ turned[::every] @ axes.T
-    return Trajectory(readings.timestamps[::every], pose(turned, np.zeros((len(turned), 3))))
+    last = len(turned) - 1  # kept: after the last orientation nothing turns
+    rows = np.append(np.arange(0, last, every), last)
+    turned = turned[rows] if axes is None else axes @ turned[rows] @ axes.T
+    return Trajectory(readings.timestamps[rows], pose(turned, np.zeros((len(turned), 3))))
 
 
 def _with_reason(

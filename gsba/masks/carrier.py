@@ -30,7 +30,7 @@ from gsba.masks.fixed_structure import (
     median_picture,
 )
 from gsba.memory import usable_cpus
-from gsba.types import FrameSet, rows_across
+from gsba.types import FrameSet, PictureFormat, rows_across
 
 logger = logging.getLogger(__name__)
 
@@ -136,9 +136,9 @@ def _outlined(pictures: np.ndarray, structure: FixedStructure) -> tuple[np.ndarr
     return median, outline_carrier(pictures, median, structure)
 
 
-def carrier_mask(carrier: Carrier, frames: FrameSet, frame: int) -> np.ndarray:
-    """Mask of the world in a frame, (H, 2H) bool, True = use."""
-    kind = frames.format_of(frame)
+def carrier_mask(carrier: Carrier, kind: PictureFormat, frame: int) -> np.ndarray:
+    """Mask of the world in the frame-th of the frames that the carrier was detected in, whose
+    pictures have a format: (H, 2H) bool, True = use."""
     size = kind.width, kind.height
     full = cv2.resize(carrier.mask.astype(np.float32), size) > 0.5
     return np.roll(full, round(carrier.turns[frame] / (2 * np.pi) * kind.width), axis=1)
@@ -155,22 +155,20 @@ def marked(picture: np.ndarray, places: np.ndarray) -> np.ndarray:
     return shown
 
 
-def write_carrier(
-    carrier: Carrier, frames: FrameSet, out: Path, merge: bool = True, name: str = "carrier"
-) -> list[Path]:
+def write_carrier(carrier: Carrier, frames: FrameSet, out: Path) -> list[Path]:
     """Write the carrier's mask, and a picture to check it; returns the files.
 
-    `NAME.png` is the mask (white = use), `NAME_check.jpg` the median picture with the outline. If
-    the frames have masks of their own, or the carrier turns, `merged/FRAME.png` combines the masks
-    of each frame, unless `merge` is False.
+    `carrier.png` is the mask (white = use), `carrier_check.jpg` the median picture with the
+    outline. If the frames have masks of their own, or the carrier turns, `merged/FRAME.png`
+    combines the masks of each frame.
     """
-    written = [out / f"{name}.png", out / f"{name}_check.jpg"]
-    write_image(written[0], carrier_mask(carrier, frames, 0).astype(np.uint8) * 255)
+    written = [out / "carrier.png", out / "carrier_check.jpg"]
+    write_image(written[0], carrier_mask(carrier, frames.format, 0).astype(np.uint8) * 255)
     write_image(written[1], marked(carrier.median, ~carrier.mask), jpeg_quality=88)
     for f, frame in enumerate(frames.names):
         own = load_mask(frames, f)
-        if merge and (own is not None or carrier.turns.any()):
-            found = carrier_mask(carrier, frames, f)
+        if own is not None or carrier.turns.any():
+            found = carrier_mask(carrier, frames.format, f)
             written.append(out / "merged" / f"{frame}.png")
             union = found if own is None else own & found
             write_image(written[-1], union.astype(np.uint8) * 255)

@@ -90,7 +90,8 @@ class StaticScene:
     Masked pixels are neither compared nor marked, nor are distractors (h, w) bool of a frame found
     before, which stay marked where too few neighbours are left to judge. Small pictures are kept in
     memory up to a limit in MB; the others are read again. neighbours: of frames to search, if other
-    frames are left out.
+    frames are left out. colours: False compares grey levels, None does where some frames are cube
+    faces, of which there are no others.
     """
 
     def __init__(
@@ -101,6 +102,7 @@ class StaticScene:
         known: Callable[[int], np.ndarray] | None = None,
         limit_mb: float = 256.0,
         neighbours: Mapping[int, np.ndarray] | None = None,
+        colours: bool | None = None,
     ) -> None:
         self._frames, self._poses, self._landmarks = frames, world_T_rigs, landmarks
         self._limit_mb, self._known_neighbours = limit_mb, neighbours or {}
@@ -109,6 +111,7 @@ class StaticScene:
             for kind in frames.formats
         )
         self._known, self._rays = known, erp_directions(self.width).astype(np.float32)
+        self._colours = all(k.panoramic for k in frames.formats) if colours is None else colours
         self._room = int(limit_mb * 2**20 / (1.5 * self.width**2))
         self._kept: dict[int, np.ndarray] = {}
         self._lock = threading.Lock()
@@ -119,7 +122,7 @@ class StaticScene:
 
     def __reduce__(self) -> tuple[object, ...]:  # workers read pictures again
         own = self._frames, self._poses, self._landmarks, self._known
-        return StaticScene, (*own, self._limit_mb, self._known_neighbours)
+        return StaticScene, (*own, self._limit_mb, self._known_neighbours, self._colours)
 
     def taken(self, chosen: Sequence[int]) -> tuple["StaticScene", dict[int, int]]:
         """The part of the scene that some frames need, for other processes, and the index in it of
@@ -143,6 +146,7 @@ class StaticScene:
             known,
             self._limit_mb,
             {number[f]: np.searchsorted(rows, others) for f, others in near.items()},
+            self._colours,
         )
         return scene, number
 
@@ -217,7 +221,7 @@ class StaticScene:
         """Small panorama (h, w, C) float32, negative where masked."""
         kept = self._kept.get(frame)
         if kept is None:
-            kept = _load(self._frames, frame, self.width)
+            kept = _load(self._frames, frame, self.width, self._colours)
             with self._lock:
                 self._kept[frame] = kept
                 while len(self._kept) > max(self._room, 1):
@@ -254,11 +258,11 @@ class StaticScene:
         return uv, np.maximum(np.linalg.norm(local, axis=1), 1e-9)
 
 
-def _load(frames: FrameSet, frame: int, width: int) -> np.ndarray:
-    """Small picture (h, w, C + 1) uint8: colours, or grey of cube faces, and the mask."""
+def _load(frames: FrameSet, frame: int, width: int, colours: bool) -> np.ndarray:
+    """Small picture (h, w, C + 1) uint8: colours of a panorama, or grey, and the mask."""
     kind = frames.format_of(frame)
     if kind.panoramic:
-        color = load_erp(frames, frame, width=width)
+        color = load_erp(frames, frame, not colours, width)
         mask = load_mask(frames, frame)
         use = np.ones(color.shape[:2], np.uint8)
         if mask is not None:

@@ -12,19 +12,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from gsba.disk import write_bytes, write_image
+from gsba.disk import encoded_image, write_bytes, write_image
 from gsba.frames.masks import levels_of, load_mask, load_weights
 from gsba.frames.pixels import load_erp
 from gsba.log import GsbaError, track
 from gsba.masks.borders import Borders, find_borders, padded
-from gsba.masks.carrier import (
-    Carrier,
-    carrier_mask,
-    find_carrier,
-    marked,
-    no_carrier,
-    write_carrier,
-)
+from gsba.masks.carrier import Carrier, carrier_mask, find_carrier, marked, no_carrier
 from gsba.masks.distractors import Distractors, KnownMasks, Look, StaticScene, distractor_weights
 from gsba.masks.segmentation import Segment, load_segmented, segmented
 from gsba.store.store import PerFrame, RunStore, fingerprint
@@ -138,7 +131,7 @@ def _carriers(
 ) -> tuple[FrameSet, list[Callable[[int], np.ndarray | None]], list[str]]:
     """Frames with the mask of each recording's carrier, or else parts of masks and their stages."""
     recordings = frames.recordings or {"": np.arange(len(frames))}
-    stages = {name: f"carrier@{name}" if name else "carrier" for name in recordings}
+    stages = {name: _carrier_stage(name) for name in recordings}
     found: dict[str, Carrier] = {}
     for name, rows in recordings.items():
         if choice.of(name).carrier:
@@ -157,7 +150,7 @@ def _carriers(
         name = frames.names[f].rpartition("/")[0]
         if name not in found:
             return None
-        return carrier_mask(found[name], frames, f - first[name])
+        return carrier_mask(found[name], frames.format_of(f), f - first[name])
 
     return frames, [part] if found else [], [stages[name] for name in found]
 
@@ -219,17 +212,22 @@ def recut(store: RunStore, frames: FrameSet, cut: int, cameras: Collection[int])
     Masks of anything else are kept."""
     masks = list(frames.mask_paths)
     for recording, rows in (frames.recordings or {"": np.arange(len(frames))}).items():
-        of = f"@{recording}" if recording else ""
-        earlier = {store.root / f"carrier{n or ''}{of}.png" for n in range(cut)}
+        earlier = {store.root / f"{_carrier_stage(recording, n)}.png" for n in range(cut)}
         camera = frames.camera_of_frame[rows[0]] if frames.camera_of_frame else 0
         if camera not in cameras or not {masks[f] for f in rows} <= earlier:
             continue
         own = frames.taken(rows) if recording else frames
-        name = f"carrier{cut}{of}"
+        name = _carrier_stage(recording, cut)
         path = store.root / f"{name}.png" if _carrier(store, own, False, name).share else None
         for f in rows:
             masks[f] = path
     return replace(frames, mask_paths=tuple(masks))
+
+
+def _carrier_stage(recording: str, cut: int = 0) -> str:
+    """Name of the stage that detects the carrier of a recording, "" = the only one, in frames of
+    the `cut`-th cut."""
+    return f"carrier{cut or ''}{recording and '@'}{recording}"
 
 
 def _carrier(store: RunStore, frames: FrameSet, required: bool, name: str) -> Carrier:
@@ -248,11 +246,14 @@ def _carrier(store: RunStore, frames: FrameSet, required: bool, name: str) -> Ca
     found = store.stage(name, (files, frames.format.fisheyes, required), compute, Carrier)
     if not found.share:
         return found
-    path = store.root / f"{name}.png"
-    if not (path.exists() and store.records[name].resumed):  # a new file would invalidate all
-        # stages
-        write_carrier(found, frames, store.root, merge=False, name=name)
-    for written in (path, store.root / f"{name}_check.jpg"):
+    path, check = store.root / f"{name}.png", store.root / f"{name}_check.jpg"
+    mask = encoded_image(carrier_mask(found, frames.format, 0).astype(np.uint8) * 255, path)
+    known = path.exists() and path.read_bytes() == mask
+    if not known:  # a new file would invalidate all stages
+        write_bytes(path, mask)
+    if not (known and check.exists() and store.records[name].resumed):
+        write_image(check, marked(found.median, ~found.mask), jpeg_quality=88)
+    for written in (path, check):
         store.claim(written)
     return found
 

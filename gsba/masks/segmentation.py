@@ -53,12 +53,10 @@ def segmented(store: RunStore, frames: FrameSet, segment: Segment) -> PerFrame[S
     ask = Once(lambda: _run(str(segment), frames, folder))
 
     def compute(name: str) -> Segmented:
-        kind = frames.format_of(index[name])
-        rig, present = cubemap.native_rig(kind, _MAX_FACE_PX), _present(kind)
-        size = rig.size
+        present, size = _present(frames.format_of(index[name])), _size(frames, index[name])
         use = np.ones((len(FACES), size, size), bool)
         if callable(segment):
-            faces, _ = cubemap.load(frames, index[name], rig)
+            faces, _ = cubemap.load(frames, index[name], CubeRig(size, np.pi / 2))
             for c in present:
                 use[c] = _checked(segment(faces[c]), size, f"{name}, {FACES[c]}")
         else:
@@ -68,10 +66,11 @@ def segmented(store: RunStore, frames: FrameSet, segment: Segment) -> PerFrame[S
                 use[c] = decode(path, (size, size), gray=True) > 127
         return Segmented(np.packbits(use), size)
 
-    sizes = [cubemap.native_rig(kind, _MAX_FACE_PX).size for kind in frames.formats]
-    cut_by = [kind.fisheyes for kind in frames.formats]
-    key = [uuid.uuid4().hex if callable(segment) else segment, *sizes, cut_by]
-    items = {name: fingerprint(frames.paths[f]) for name, f in index.items()}
+    key = uuid.uuid4().hex if callable(segment) else segment
+    items = {
+        name: (fingerprint(frames.paths[f]), frames.format_of(f).fisheyes, _size(frames, f))
+        for name, f in index.items()
+    }
     found = store.per_frame("segmented", key, items, compute, Segmented, alone=True)
     shutil.rmtree(folder, ignore_errors=True)
     return found
@@ -82,6 +81,11 @@ def load_segmented(found: PerFrame[Segmented], frames: FrameSet, frame: int) -> 
     one = found[frames.names[frame]]
     use = np.unpackbits(one.bits, count=len(FACES) * one.size**2) > 0
     return use[_places(one.size)]
+
+
+def _size(frames: FrameSet, frame: int) -> int:
+    """Pixels across the faces of a frame."""
+    return cubemap.native_rig(frames.format_of(frame), _MAX_FACE_PX).size
 
 
 def _face_file(name: str, face: int) -> str:

@@ -37,13 +37,14 @@ def match_neighbours(state: State) -> State:
 
 @contextmanager
 def naming_recording(name: str) -> Iterator[None]:
-    """Name a recording in the message of a GsbaError; "" = the only one, which needs no name."""
+    """Name a recording in the message of a GsbaError, which stays what it is; "" = the only one,
+    which needs no name."""
     try:
         yield
     except GsbaError as error:
-        if not name:
-            raise
-        raise GsbaError(f"recording '{name}': {error}") from error
+        if name:
+            error.begin_with(f"recording '{name}'")
+        raise
 
 
 def _match(state: State, number: int) -> State:

@@ -49,6 +49,10 @@ def trajectory_files(
 ) -> dict[str, Path]:
     """The files that poses come from, by what they are."""
     given = [trajectory] if isinstance(trajectory, Path | str) else list(trajectory or ())
+    if keyframes is not None and not given:
+        raise GsbaError(
+            f"keyframes {keyframes} need the trajectory of the same SLAM run: give both"
+        )
     if keyframes is not None and len(given) > 1:
         raise GsbaError("keyframes go with one trajectory: give either several, or keyframes")
     origin = {f"trajectory{n or ''}": Path(path) for n, path in enumerate(given)}

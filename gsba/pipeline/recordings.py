@@ -81,9 +81,9 @@ class GivenRecording:
     def of(cls, recording: Recording, name: str, convention: Convention) -> "GivenRecording":
         """A recording whose trajectory files are read, before any video is decoded."""
         folder, prefix = Path(recording.frames), f"{name}: " if name else ""
-        poses = inputs.trajectory_files(recording.trajectory, _path(recording.keyframes))
-        origin = {"frames": folder} | poses
         with naming_recording(name):
+            poses = inputs.trajectory_files(recording.trajectory, _path(recording.keyframes))
+            origin = {"frames": folder} | poses
             pieces = inputs.read_trajectories(origin, _path(recording.timestamps), convention)
         files = {f"{prefix}{what}": path for what, path in origin.items()}
         return cls(name, recording, files, tuple(pieces), folder)

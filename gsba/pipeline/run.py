@@ -149,7 +149,7 @@ class Run:
         start = coarse.world_T_rigs.tolist(), origins, settings.read
         timed_frames = frames.timed_of_frame or frames.timed
         timing = frames.timestamps.tolist(), frames.clock_shifts, timed_frames
-        inputs = [fingerprint(paths), *timing, *start]
+        inputs = [fingerprint(paths), frames.names, *timing, *start]
         inputs += [frames.camera_of_frame, *map(asdict, frames.formats), lenses_found]
         store.stage("frames", inputs, lambda: frames, FrameSet)
         return cls(

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from gsba.bundle.gps_factors import MIN_FIXES
 from gsba.bundle.map_strength import scale_sigmas
 from gsba.bundle.readout import CameraEstimate
 from gsba.bundle.stitching import Stitching
@@ -241,6 +242,11 @@ def notes_on_gps(content: Mapping[str, Any], num_frames: int) -> list[str]:
             f"GPS was not used: the images contradict its {content['fixes']} positions: {why}; "
             "check the positions, their noise and their clock"
         )
+        if content["too_few_in_each_map"]:
+            note = (
+                f"GPS was not used: frames came out in maps of which none has {MIN_FIXES} of the "
+                f"{content['fixes']} positions"
+            )
         logger.warning(note)
         return [note]
     typical, claimed = content["rms_m_east_north_up"], content["sigma_m_east_north_up"][0]
@@ -250,6 +256,8 @@ def notes_on_gps(content: Mapping[str, Any], num_frames: int) -> list[str]:
         f"horizontally and {typical[2]:.2g} m vertically (rms; the assumed sigma is {claimed:.2g} "
         "m per axis)"
     )
+    if content["fixes_elsewhere"]:
+        note += f"; {content['fixes_elsewhere']} positions are of maps that they do not place"
     if false:
         note += f"; {len(false)} fixes are outliers: {named(false, 'gps.false_fixes')}"
     return [note]

@@ -398,10 +398,11 @@ def digest(*parts: object) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def fingerprint(paths: Iterable[Path | None]) -> tuple[tuple[str, int, int], ...]:
-    """Resolved path, size in bytes and modification time in ns of each input file."""
-    stats = ((path.resolve(), path.stat()) for path in paths if path is not None)
-    return tuple((str(path), stat.st_size, stat.st_mtime_ns) for path, stat in stats)
+def fingerprint(paths: Iterable[Path | None]) -> tuple[tuple[str, int, int] | None, ...]:
+    """Resolved path, size in bytes and modification time in ns of each input file; None where there
+    is no file, so that a file of one frame is never taken for that of another."""
+    stats = ((path.resolve(), path.stat()) if path is not None else None for path in paths)
+    return tuple(one and (str(one[0]), one[1].st_size, one[1].st_mtime_ns) for one in stats)
 
 
 def _jsonable(value: object) -> object:

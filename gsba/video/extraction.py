@@ -297,7 +297,8 @@ def _take_over(out: Path, key: str, replace: bool) -> Counts | None:
     path = out / TIMES
     written = [row.name for row in read_times(path) if row.name] if path.is_file() else []
     folders = _folders(out, lenses)
-    if same and (counts is None or all((f / n).is_file() for f in folders for n in written)):
+    whole = path.is_file() and all((f / n).is_file() for f in folders for n in written)
+    if same and (counts is None or whole):
         return counts
     if not same and not replace:
         raise GsbaError(

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from fractions import Fraction
-from itertools import chain, islice
+from itertools import chain, islice, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -182,7 +182,7 @@ def container_tags(video: Path) -> dict[str, str]:
 
 def read_timeline(track: Track) -> Timeline:
     """Presentation times of all frames of a track, from its packets alone. GsbaError: the file is
-    no video, there is no decoder for it, or it holds no frames."""
+    no video, there is no decoder for it, it holds no frames, or states times in another order."""
     video = track.path
     with _opened(video) as (container, streams):
         stream = streams[track.number]
@@ -194,6 +194,9 @@ def read_timeline(track: Track) -> Timeline:
         packets = [(pts, dts, key) for pts, dts, key in packets if pts is not None]
         if not packets:
             raise GsbaError(f"{video} holds no frames: copy or export it again")
+        lags = {pts - dts for pts, dts, _ in packets if dts is not None}
+        if len(lags) < 2 and stream.codec_context.has_b_frames:
+            _refuse_another_order(video, container, stream, packets[0][1] or 0)
         ticks = np.unique([pts for pts, _, _ in packets])
         starts = sorted((pts, pts if dts is None else dts) for pts, dts, key in packets if key)
         last = float((ticks[-1] - ticks[0]) * stream.time_base)
@@ -204,6 +207,20 @@ def read_timeline(track: Track) -> Timeline:
             stream.height,
             *np.array(starts or [(ticks[0], ticks[0])], np.int64).T,
             claimed_s=max(last, _claimed_end(container, stream) or 0.0),
+        )
+
+
+def _refuse_another_order(video: Path, container: Any, stream: Any, begin: int) -> None:
+    """Refuse stated times that do not ascend as pictures are shown: AVI has none, and H.264 in it
+    gets those of the order in which pictures are stored."""
+    container.seek(begin, stream=stream)
+    packets = islice(container.demux(stream), _MAX_CLAIM_PACKETS)
+    shown = [picture.pts for picture in chain.from_iterable(_decoded(packets))]
+    if any(after < before for before, after in pairwise(pts for pts in shown if pts is not None)):
+        raise GsbaError(
+            f"{video}: it states times in the order in which its pictures are stored, not shown "
+            "(H.264 with B-frames in AVI): export it as MP4, or convert it (ffmpeg -i "
+            f"{video.name} ONE.mp4)"
         )
 
 

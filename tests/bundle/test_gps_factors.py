@@ -11,11 +11,12 @@ from synthetic import RIG, World, drifted, make_world
 
 from gsba.bundle import adjustment, gps_factors
 from gsba.bundle.adjustment import AdjustmentContext, values_of
-from gsba.bundle.families import Bearings, Families, Family
+from gsba.bundle.families import Bearings, Families, Family, MapSnapshot
 from gsba.bundle.gps_factors import FrameFixes, GpsFactors
 from gsba.bundle.trajectory_prior import TrajectoryPrior
 from gsba.config import RefineSettings
 from gsba.geometry import furthest, inverse
+from gsba.report.findings import notes_on_gps
 from gsba.similarity import Sim3, pose_similarity
 from gsba.types import Solution
 
@@ -92,6 +93,21 @@ def test_each_map_has_a_similarity_of_its_own() -> None:
     some = _fixes(world, 0, 0.0).taken(np.arange(24) < 12)
     anchors = gps_factors.anchor(poses, some, maps)
     assert anchors is not None and list(anchors.level_from_map) == [0]
+
+
+def test_fixes_of_maps_that_they_do_not_place_are_not_called_false() -> None:
+    world, maps = make_world(0, 24), np.repeat([0, 1], [20, 4])
+    nothing = Solution.without_points(world.world_T_rigs).landmarks
+    names = tuple(map(str, range(24)))
+    given = names, TIMES, world.world_T_rigs, maps, nothing, gtsam.Values()
+    fixes = _fixes(world, 1)
+    fixes.positions[7] += 50.0
+    said = GpsFactors(fixes).report(MapSnapshot(*given))
+    assert said["false_fixes"] == ["7"] and said["used"] == 19 and said["fixes_elsewhere"] == 4
+    (note,) = notes_on_gps(said, 24)
+    assert "1 fixes are outliers: 7" in note and "4 positions are of maps" in note
+    few = GpsFactors(fixes.taken(np.arange(24) >= 16)).report(MapSnapshot(*given))
+    assert not few["taken"] and "maps of which none has 5" in notes_on_gps(few, 24)[0]
 
 
 def _far_off(world_T_rigs: np.ndarray, true: np.ndarray) -> np.ndarray:

@@ -7,12 +7,13 @@ import pytest
 from pixels import pixel_centres
 from scipy.spatial.transform import Rotation
 from synthetic import unit
-from two_fisheyes import colours, made_pair
+from two_fisheyes import colours, made_pair, turned
 
 from gsba.camera.fisheye import Pair, rotation_of, unproject
 from gsba.camera.lens import Lenses, rows_run
 from gsba.camera.one_centre import Stitcher
 from gsba.camera.pictures import lens_picture, panorama
+from gsba.camera.rig import RIG_R_FACE, owner_faces
 from gsba.camera.sphere import erp_directions
 from gsba.camera.views import depths_along
 from gsba.types import Fisheye
@@ -117,6 +118,20 @@ def test_raw_pictures_become_one_cameras_at_one_instant(ways: tuple[float, float
     for wrong, scene in ((lenses, np.zeros((0, 3))), (still, _scene())):
         other = _off(Stitcher(wrong, 0, scene).stitched(pictures, WIDTH), seam)
         assert min(other) > 3 * max(found)
+
+
+def test_lenses_that_look_up_and_down_show_nothing_at_the_other_pole() -> None:
+    """Of panoramas with more rows than are stitched at once."""
+    lens = Fisheye(80, 80, 25.0, (40.0, 40.0), (0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    rig = tuple(turned(lens, rig_R_face) for rig_R_face in RIG_R_FACE)
+    greys = [40 * face + 20 for face in range(6)]
+    pictures = [
+        lens_picture(one, np.full((80, 80, 3), grey, np.uint8))
+        for one, grey in zip(rig, greys, strict=True)
+    ]
+    found = Stitcher(Lenses.of_raw(rig), 0, np.zeros((0, 3))).stitched(pictures, 1024)
+    faced = owner_faces(erp_directions(1024))
+    assert np.mean(found[..., 0] == np.array(greys)[faced]) > 0.99
 
 
 def test_masks_move_along() -> None:

@@ -9,7 +9,9 @@ from riding_gyro import BIAS, IMU_R_RIG, OFFSET_S, SIGMA, UP, Ride, aligned, rid
 from scipy.spatial.transform import Rotation
 
 from gsba.imu.alignment import Alignment, align, turning_of
-from gsba.imu.readings import Readings
+from gsba.imu.readings import Readings, Sensor
+from gsba.trajectory.clock import Clock
+from gsba.types import Counts
 
 
 @cache
@@ -112,6 +114,18 @@ def test_what_a_gyro_says_of_frames_is_how_they_turn() -> None:
     off = np.sqrt(np.mean((said.rates - on.rates(on.timestamps)) ** 2))
     assert 0.3 < off / said.rate_sigma < 1.5
     assert np.isfinite(said.step_sigmas).all()
+
+
+def test_the_last_step_turns_where_fast_readings_end_with_the_frames() -> None:
+    """Readings 1 ms apart are thinned out; the last one is not lost."""
+    frames, rate = np.array([0.0, 1.0, 2.0, 3.0, 4.0015]), 0.5
+    times = 0.001 * np.arange(4003)
+    readings = Readings(times, np.tile([0.0, rate, 0.0], (len(times), 1)))
+    clock, counts = Clock(0.0, 0.0, 1.0), Counts(4, 4, "steps")
+    found = Alignment(clock, 1e-4, Sensor.ideal(), np.eye(3), 1e-3, 1e-3, 1.0, counts)
+    said = turning_of(readings, found, frames)
+    assert np.isfinite(said.step_sigmas).all()
+    np.testing.assert_allclose(said.steps[:, 1], rate * np.diff(frames), atol=1e-9)
 
 
 def test_where_readings_end_or_pause_nothing_is_said() -> None:

@@ -111,7 +111,7 @@ def test_a_carrier_that_turns_below_the_picture_is_found(tmp_path: Path, look: s
         picture[outline] = np.clip(noisy, 0, 255)
         write_image(path, picture)
     carrier = find_carrier(frames)
-    found = [~carrier_mask(carrier, frames, f) for f in range(len(frames))]
+    found = [~carrier_mask(carrier, frames.format, f) for f in range(len(frames))]
     for f, turn in enumerate(turns):
         assert _overlap(found[f], np.roll(mask, turn, axis=1)) >= 0.9
     written = write_carrier(carrier, frames, tmp_path / "m")

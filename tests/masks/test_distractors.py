@@ -4,6 +4,7 @@ import dataclasses
 import json
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from people import make_people, paste_people
@@ -11,16 +12,20 @@ from refusals import refused
 from tiny_run import SETTINGS, Case, computed_stages
 
 from gsba import refine
+from gsba.camera.rig import CubeRig
 from gsba.camera.sphere import erp_from_bearings
 from gsba.disk import write_image
 from gsba.evaluate.trajectory import evaluate
+from gsba.frames import cut, scan
 from gsba.frames.masks import levels_of, load_mask, load_weights
 from gsba.frames.pixels import load_erp
+from gsba.frames.recordings import combine
+from gsba.geometry import unit
 from gsba.masks.distractors import StaticScene, distractor_mask, distractor_weights
 from gsba.masks.merging import choose
 from gsba.store.store import load_stage
 from gsba.trajectory.files import read_trajectory
-from gsba.types import FrameSet, Solution
+from gsba.types import FACES, Counts, FrameSet, Landmarks, Solution, Tracks
 
 UP = np.array([0.0, -1.0, 0.0])  # of the gallery
 
@@ -131,6 +136,37 @@ def test_a_run_masks_people_in_a_second_pass(case: Case, tmp_path: Path) -> None
     start = evaluate(read_trajectory(case.slam), case.truth)
     assert errors.ate.rmse < 0.1 * start.ate.rmse  # masks are for splats: poses hardly gain
     assert computed_stages(run()) == []
+
+
+def test_panoramas_and_cube_faces_are_compared_by_grey_levels(tmp_path: Path) -> None:
+    """Of one place: a thing that one frame alone shows is found in either, by shards too."""
+    rng, recordings = np.random.default_rng(0), {}
+    plain = cv2.GaussianBlur(rng.integers(0, 255, (128, 256, 3), np.uint8), (0, 0), 3.0)
+    thing = plain.copy()
+    thing[44:84, 30:60] = 255 - plain[44:84, 30:60] // 4  # in the left face
+    rig = CubeRig(64, np.pi / 2)
+    for name in ("panoramas", "faces"):
+        for n, picture in enumerate([thing, plain, plain, plain]):
+            if name == "panoramas":
+                write_image(tmp_path / name / f"{n}.png", picture)
+            else:
+                for face, image in zip(FACES, cut(picture, rig), strict=True):
+                    write_image(tmp_path / name / face / f"{n}.png", image)
+        recordings[name] = scan(tmp_path / name, fps=1.0)
+    frames = combine(recordings)
+    num, points = len(frames), 3 * unit(rng.normal(size=(60, 3)))
+    poses = np.tile(np.eye(4), (num, 1, 1))
+    poses[:, 0, 3] = 1e-3 * np.arange(num)
+    each, of = np.repeat(np.arange(60), num), np.tile(np.arange(num), 60)
+    tracks = Tracks(each.astype(np.int32), of.astype(np.int32), each.astype(np.int32), 60)
+    scene = StaticScene(frames, poses, Landmarks(points, tracks, Counts(60, 60, "tracks")))
+    for f in range(num):
+        found = scene.find(f)
+        assert not found.reason
+        place = distractor_mask(found)[50:78, 36:54].mean()
+        assert place > 0.9 if f in (0, 4) else place == 0
+        part, number = scene.taken([f])
+        np.testing.assert_array_equal(part.find(number[f]).weights, found.weights)
 
 
 def test_masks_are_chosen_by_name(tmp_path: Path) -> None:

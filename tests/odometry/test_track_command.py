@@ -106,8 +106,9 @@ def test_frames_are_extracted_by_what_they_show(video: Path, tmp_path: Path) -> 
     names = sorted(path.name for path in frames.glob("*.jpg"))
     assert 3 < len(names) == len(chosen.timestamps) < 34
     assert [f"{round(t * FPS):06d}.jpg" for t in chosen.timestamps] == names
-    again = succeed("extract", video, "--every", "auto", "--out", frames)
-    assert f"{len(names)} of" in again.output
+    for more in ((), ("--fresh",)):
+        again = succeed("extract", video, "--every", "auto", "--out", frames, *more)
+        assert f"{len(names)} of" in again.output
 
 
 def test_a_video_is_refined_from_its_own_odometry(

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -319,3 +320,10 @@ def test_keyframes_go_with_one_trajectory(case: Case, tmp_path: Path) -> None:
     options = ("--keyframes", str(case.slam))
     result = _refine(tmp_path / "run", case.frames, *given, options=options)
     assert result.exit_code == 1 and "keyframes go with one trajectory" in result.stderr
+
+
+def test_keyframes_of_a_recording_need_its_trajectory(case: Case, tmp_path: Path) -> None:
+    one = f"{case.frames},name=walk,keyframes={case.slam}"
+    result = run_gsba("refine", "--recording", one, "--recording", case.out, "--out", tmp_path)
+    said = "recording 'walk': keyframes .* need the trajectory of the same SLAM run: give both"
+    assert result.exit_code == 1 and re.search(said, result.stderr)

@@ -4,6 +4,8 @@ settings it was not computed with."""
 import json
 from collections import defaultdict
 from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -14,12 +16,16 @@ from plain_records import frames_of
 from pydantic import BaseModel
 from synthetic import loop_walk
 from tiny_run import LIGHT, Case
+from two_fisheyes import made_pair, write
 
 from gsba import refine
 from gsba.camera.cameras import Cameras
 from gsba.config import CameraSettings, ExportSettings, RefineSettings
 from gsba.config_file import load_config
+from gsba.features import SiftExtractor, extraction
+from gsba.frames.cubemap import rig_for
 from gsba.frames.recordings import combine
+from gsba.masks.segmentation import segmented
 from gsba.pipeline import backend, camera, outputs
 from gsba.pipeline.run import Run
 from gsba.placement.placement import Placement
@@ -94,6 +100,59 @@ def test_clocks_of_recordings_and_the_origin_of_the_world_are_in_keys(
             Run.begin(run, known, coarse, RefineSettings())
             assert not run.records["frames"].resumed
     assert load_stage(tmp_path / "run", "frames", FrameSet).clock_shifts == (-clock_s,) * 4
+
+
+def test_whose_a_mask_is_and_what_recordings_are_called_are_in_keys(tmp_path: Path) -> None:
+    """Though files, numbers of frames and times stay the same."""
+    for name in ("a0.jpg", "b0.jpg", "stick.png"):
+        (tmp_path / name).write_text(name)
+    kind, stick = PictureFormat("erp", 512, 256), tmp_path / "stick.png"
+
+    def both(*masks: Path | None, names: tuple[str, str] = ("a", "b")) -> FrameSet:
+        files = [[(tmp_path / f"{letter}0.jpg",)] * 4 for letter in "ab"]
+        parts = zip(names, files, masks, strict=True)
+        return combine({name: frames_of(kind, own, mask=mask) for name, own, mask in parts})
+
+    coarse = CoarsePoses(np.tile(loop_walk(4), (2, 1, 1)), np.zeros(8, np.uint8), 0.0)
+    for frames in (both(stick, None), both(None, stick), both(None, stick, names=("a", "attic"))):
+        with RunStore(tmp_path / "run", {"frames": tmp_path}) as run:
+            Run.begin(run, frames, coarse, RefineSettings())
+        kept = load_stage(tmp_path / "run", "frames", FrameSet)
+        assert kept.mask_paths == frames.mask_paths and kept.names == frames.names
+
+
+@pytest.mark.parametrize("stage", ["features", "segmented"])
+def test_a_recording_under_the_calibration_of_another_one_is_cut_anew(
+    stage: str, tmp_path: Path
+) -> None:
+    """Though the calibrations of all cameras stay the same."""
+    pair = made_pair(64)
+    other = replace(pair[0], focal=1.2 * pair[0].focal), pair[1]
+    rng, settings, folder = np.random.default_rng(0), RefineSettings(), tmp_path / "run"
+    files = {
+        name: tuple(
+            write(tmp_path / f"{name}{n}.png", rng.integers(40, 250, (64, 64, 3), np.uint8))
+            for n in range(2)
+        )
+        for name in "abc"
+    }
+    for last in (pair, other):
+        lenses = {"a": pair, "b": other, "c": last}
+        frames = combine(
+            {
+                name: frames_of(PictureFormat("fisheye", 128, 64, fisheyes=one), [files[name]] * 2)
+                for name, one in lenses.items()
+            }
+        )
+        assert [kind.fisheyes for kind in frames.formats] == [pair, other]
+        with RunStore(folder, {"frames": tmp_path}) as run:
+            if stage == "segmented":
+                segmented(run, frames, "cp {image} {mask}")
+            else:
+                rig = rig_for(frames.formats[0], settings.cubemap)
+                make = partial(SiftExtractor, settings.features)
+                extraction.extract(run, extraction.Search(frames, rig, settings, make), [])
+            assert not run.records[stage].resumed
 
 
 def test_baselines_are_in_keys_of_results_that_depend_on_them() -> None:

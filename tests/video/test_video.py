@@ -1,6 +1,7 @@
 """Frames from videos made here: which, when, how sharp, resumed, and what is refused."""
 
 import json
+from fractions import Fraction
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -89,6 +90,28 @@ def test_times_are_those_of_presentation(tmp_path: Path, suffix: str, codec: str
     frames = scan(tmp_path / "frames")
     np.testing.assert_array_equal(frames.timestamps, list(times.values()))
     assert (frames.format.width, frames.format.height) == (WIDTH, HEIGHT)
+
+
+@pytest.mark.parametrize(("codec", "reorders"), [("libx264", True), ("mpeg4", False)])
+def test_times_of_the_stored_order_are_refused(tmp_path: Path, codec: str, reorders: bool) -> None:
+    """As of H.264 with B-frames in AVI, which would give pictures the times of others."""
+    video = tmp_path / "walk.avi"
+    with av.open(str(video), "w") as container:
+        stream = container.add_stream(codec, rate=30)
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+        stream.codec_context.max_b_frames = 2
+        for index in range(30):
+            frame = av.VideoFrame.from_ndarray(_picture(index, 2 * index), format="rgb24")
+            frame.pts, frame.time_base = index, Fraction(1, 30)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    if reorders:
+        refused(
+            r"walk\.avi: it states times.*stored", extract, video, tmp_path / "no", VideoSettings()
+        )
+        return
+    extract(video, tmp_path / "frames", VideoSettings(every=7))
+    assert _indices(tmp_path / "frames") == [0, 7, 14, 21, 28]
 
 
 def test_one_frame_a_second_and_the_sharpest_of_it(film: Path, tmp_path: Path) -> None:
@@ -205,6 +228,17 @@ def test_edited_extractions_are_refused(
         (out / "extract.json").write_text(json.dumps(marker))
     (out / name).write_text(content)
     refused(message, extract, film, out, settings)
+
+
+@pytest.mark.parametrize("gone", ["timestamps.csv", "000030.jpg"])
+def test_what_an_extraction_lacks_is_made_again(film: Path, tmp_path: Path, gone: str) -> None:
+    """Frames without their table would have no times, or those of another rate."""
+    out = tmp_path / "frames"
+    extract(film, out, VideoSettings(every=30))
+    whole = {path.name: path.read_bytes() for path in out.iterdir()}
+    (out / gone).unlink()
+    extract(film, out, VideoSettings(every=30))
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == whole
 
 
 def test_colours_survive(tmp_path: Path) -> None:
@@ -405,6 +439,22 @@ def test_poses_of_chosen_frames_replace_no_file_of_ones_own(
     (out / "notes.txt").touch()
     fails(run_gsba(*auto), "walk is not empty and not an extraction")
     assert not runs
+
+
+@pytest.mark.parametrize(
+    ("more", "told"),
+    [((), "frames that were chosen otherwise"), (["--fresh"], "walk.tum: poses of the chosen")],
+)
+def test_chosen_frames_do_not_replace_a_trajectory(
+    film: Path, tmp_path: Path, more: tuple[str, ...], told: str
+) -> None:
+    """Of the name of the folder, as documented for recordings and their trajectories."""
+    own, out = tmp_path / "walk.tum", tmp_path / "walk"
+    write_tum(own, Trajectory(np.arange(5) / 4, np.tile(np.eye(4), (5, 1, 1))))
+    before = own.read_bytes()
+    succeed("extract", film, "--out", out, "--at", own)
+    fails(run_gsba("extract", film, "--out", out, "--every", "auto", *more), told)
+    assert own.read_bytes() == before
 
 
 def test_missing_library_is_one_line(
