@@ -83,9 +83,8 @@ def is_kitti(path: Path) -> bool:
     return False
 
 
-def write_tum(path: Path, trajectory: Trajectory, comment: str = "") -> None:
-    """Write `timestamp tx ty tz qx qy qz qw` lines that `read_trajectory` takes back, below a
-    comment.
+def write_tum(path: Path, trajectory: Trajectory) -> None:
+    """Write `timestamp tx ty tz qx qy qz qw` lines that `read_trajectory` takes back.
 
     Timestamps survive exactly, values to 15 digits. The file appears whole or not at all.
     GsbaError: it cannot be written, or a pose is not finite or holds no rotation.
@@ -102,8 +101,7 @@ def write_tum(path: Path, trajectory: Trajectory, comment: str = "") -> None:
         " ".join([repr(float(time)), *(f"{value:.15g}" for value in row)]) + "\n"
         for time, row in zip(trajectory.timestamps, values, strict=True)
     ]
-    head = f"# {comment}\n" if comment else ""
-    write_bytes(path, "".join([head, *lines]).encode("ascii"), parents=False)
+    write_bytes(path, "".join(lines).encode("ascii"), parents=False)
 
 
 def _read_tum(path: Path, rows: Sequence[tuple[int, str]]) -> Trajectory:
