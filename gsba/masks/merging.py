@@ -140,9 +140,9 @@ def _carriers(
     recordings = frames.recordings or {"": np.arange(len(frames))}
     stages = {name: f"carrier@{name}" if name else "carrier" for name in recordings}
     found: dict[str, Carrier] = {}
-    for name, rows in recordings.items():
+    each = {n: frames.taken(rows) if n else frames for n, rows in recordings.items()}
+    for name, own in each.items():
         if choice.of(name).carrier:
-            own = frames.taken(rows) if frames.recordings else frames
             carrier = _carrier(store, own, choice.of(name).carrier_required, stages[name])
             if carrier.share:
                 found[name] = carrier
@@ -157,7 +157,7 @@ def _carriers(
         name = frames.names[f].rpartition("/")[0]
         if name not in found:
             return None
-        return carrier_mask(found[name], frames, f - first[name])
+        return carrier_mask(found[name], each[name], f - first[name])
 
     return frames, [part] if found else [], [stages[name] for name in found]
 

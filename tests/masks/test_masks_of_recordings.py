@@ -108,3 +108,22 @@ def test_distractors_are_masked_where_a_recording_asks(
             hidden = _hidden(merged)
         assert counts.received == 2
         assert hidden == [float("distractors" in masks.get(name, "")) for name in "abc"]
+
+
+def test_a_carrier_that_turns_is_masked_behind_a_recording_of_cube_faces(
+    recordings: FrameSet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whose faces are as wide as the panoramas."""
+    mask = np.ones((32, 64), bool)
+    mask[-8:, :8] = False
+    turned = Carrier(mask, np.array([0, 0.5]), np.zeros((32, 64, 3), np.uint8), 0.1, "")
+    monkeypatch.setattr(merging, "find_carrier", lambda _: turned)
+    monkeypatch.setattr(merging, "write_carrier", lambda *_, **__: [])
+    cube = PictureFormat("cube", 512, 512, ("front", "right", "back", "left", "up", "down"))
+    frames = replace(
+        recordings, formats=(cube, *recordings.formats), camera_of_frame=(0, 0, 1, 1, 1, 1)
+    )
+    with RunStore(tmp_path / "run", {"frames": tmp_path}) as store:
+        found = merging.before(store, frames, _asking(a="none", b="auto", c="none"))
+    hidden = [np.flatnonzero(~np.array(load_mask(found, f))[200]) for f in (2, 3)]
+    assert hidden[0][0] == 0 and (hidden[1] - hidden[0] == round(512 * 0.5 / (2 * np.pi))).all()
