@@ -31,6 +31,7 @@ from gsba.types import Counts, Matches, Solution
 
 logger = logging.getLogger(__name__)
 _NUM_CANDIDATES = 3  # candidate places for each frame of a part; twice as many for a single frame
+_NUM_MEETINGS = 24  # pairs of frames sharing the most points, to propose a similarity at each pace
 _BREAK_REACH_FRAMES = 3  # frames from a break that are compared in any case
 _MAX_PACES = 3.0  # largest distance of a single frame from its neighbours, in median paces
 # Largest angle between the verticals of two parts, besides the spread within each: of one
@@ -277,7 +278,8 @@ class _Joining:
             return found
         meetings, usual = list[Meeting](), list[Judged]()
         for move in breaks.at_usual_pace(found.proposal.move):
-            meetings += self.test.meetings(self.test.weigh(rows, inside, move)[1], rows)
+            met = self.test.meetings(self.test.weigh(rows, inside, move)[1], rows)
+            meetings += sorted(met, key=lambda one: -len(one.own))[:_NUM_MEETINGS]
         for proposal in propose(meetings, self.poses, self.depth, self.context.settings.seed):
             one = self.test.judge(proposal, rows, inside, usual)
             if (

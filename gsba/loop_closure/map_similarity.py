@@ -19,6 +19,7 @@ from gsba.types import Matches
 _LOSS_DEG = 0.2  # scale of the robust loss: points of two maps have correlated errors
 _MIN_COMMON_POINTS = 6  # least common inliers of two frames that propose a similarity
 _BESIDE = 3  # frames to either side of a meeting whose points it may count
+_MOST_POINTS = 20000  # of all meetings, by which similarities are compared
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +62,7 @@ class Proposal:
 
     move: Sim3
     frames: tuple[int, int]  # outside and inside, whose points give the similarity
-    support: int  # inliers among the points of all meetings
+    support: int  # inliers among the points of all meetings, or among some of very many
 
 
 def propose(meetings: list[Meeting], poses: np.ndarray, depth: float, seed: int) -> list[Proposal]:
@@ -87,6 +88,8 @@ def _proposed(
     found = []
     at_f, own = _in_world(poses, [(m.f, m.own) for m in meetings])
     at_g, theirs = _in_world(poses, [(m.g, m.theirs) for m in meetings])
+    some = slice(None, None, -(-len(own) // _MOST_POINTS))
+    at_f, own, at_g, theirs = at_f[some], own[some], at_g[some], theirs[some]
     for m in given:
         similarity = _similarity_of_meeting(m, seed)
         if similarity is None:
