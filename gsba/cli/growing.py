@@ -1,5 +1,6 @@
 """Commands on finished runs: `add`, `merge`, `remove`, `localize`."""
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -49,14 +50,14 @@ def add(
     conclude([result], allow_partial)
 
 
-def _refuse_changed(runs: list[Path], without: list[str] | None = None) -> None:
+def _refuse_changed(runs: list[Path], without: Collection[str] = ()) -> None:
     """Refuse runs whose frames, but those of some recordings, are no longer those that they were
     made of."""
     from gsba.inspection.changed_frames import refuse_changed_frames
     from gsba.store.finished import load_run
 
     for run in runs:
-        refuse_changed_frames(run, *load_run(run), without or ())
+        refuse_changed_frames(run, *load_run(run), without)
 
 
 @command

@@ -88,7 +88,7 @@ def _proposed(
     found = []
     at_f, own = _in_world(poses, [(m.f, m.own) for m in meetings])
     at_g, theirs = _in_world(poses, [(m.g, m.theirs) for m in meetings])
-    some = slice(None, None, -(-len(own) // _MOST_POINTS))
+    some = slice(None, None, len(own) // _MOST_POINTS + 1)
     at_f, own, at_g, theirs = at_f[some], own[some], at_g[some], theirs[some]
     for m in given:
         similarity = _similarity_of_meeting(m, seed)

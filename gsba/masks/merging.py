@@ -110,8 +110,7 @@ def _borders(
 ) -> dict[str, Callable[[int], np.ndarray | None]]:
     """Masks of areas that are black in all frames of a recording, by the name of their stage."""
     parts: dict[str, Callable[[int], np.ndarray | None]] = {}
-    for name, rows in (frames.recordings or {"": np.arange(len(frames))}).items():
-        own = frames.taken(rows) if frames.recordings else frames
+    for name, (rows, own) in _by_recording(frames).items():
         if not (choice.of(name).carrier or padded(own)):
             continue
         found = find_borders(own)
@@ -130,12 +129,11 @@ def _carriers(
     store: RunStore, frames: FrameSet, choice: Choice, alone: bool
 ) -> tuple[FrameSet, list[Callable[[int], np.ndarray | None]], list[str]]:
     """Frames with the mask of each recording's carrier, or else parts of masks and their stages."""
-    recordings = frames.recordings or {"": np.arange(len(frames))}
+    recordings = _by_recording(frames)
     stages = {name: _carrier_stage(name) for name in recordings}
     found: dict[str, Carrier] = {}
-    for name, rows in recordings.items():
+    for name, (_, own) in recordings.items():
         if choice.of(name).carrier:
-            own = frames.taken(rows) if frames.recordings else frames
             carrier = _carrier(store, own, choice.of(name).carrier_required, stages[name])
             if carrier.share:
                 found[name] = carrier
@@ -144,7 +142,7 @@ def _carriers(
         paths = [name.rpartition("/")[0] for name in frames.names]
         masks = [store.root / f"{stages[name]}.png" if name in found else None for name in paths]
         return replace(frames, mask_paths=tuple(masks)), [], []
-    first = {name: int(rows[0]) for name, rows in recordings.items()}
+    first = {name: int(rows[0]) for name, (rows, _) in recordings.items()}
 
     def part(f: int) -> np.ndarray | None:
         name = frames.names[f].rpartition("/")[0]
@@ -211,17 +209,22 @@ def recut(store: RunStore, frames: FrameSet, cut: int, cameras: Collection[int])
     calibration, the `cut`-th from 1: the carrier of each of their recordings is detected again.
     Masks of anything else are kept."""
     masks = list(frames.mask_paths)
-    for recording, rows in (frames.recordings or {"": np.arange(len(frames))}).items():
+    for recording, (rows, own) in _by_recording(frames).items():
         earlier = {store.root / f"{_carrier_stage(recording, n)}.png" for n in range(cut)}
         camera = frames.camera_of_frame[rows[0]] if frames.camera_of_frame else 0
         if camera not in cameras or not {masks[f] for f in rows} <= earlier:
             continue
-        own = frames.taken(rows) if recording else frames
         name = _carrier_stage(recording, cut)
         path = store.root / f"{name}.png" if _carrier(store, own, False, name).share else None
         for f in rows:
             masks[f] = path
     return replace(frames, mask_paths=tuple(masks))
+
+
+def _by_recording(frames: FrameSet) -> dict[str, tuple[np.ndarray, FrameSet]]:
+    """Rows (R,) and frames of each recording by its name; "" = there is only one."""
+    several = {name: (rows, frames.taken(rows)) for name, rows in frames.recordings.items()}
+    return several or {"": (np.arange(len(frames)), frames)}
 
 
 def _carrier_stage(recording: str, cut: int = 0) -> str:

@@ -36,7 +36,7 @@ from gsba.pipeline.stage_titles import title_of
 from gsba.pipeline.state import State
 from gsba.similarity import NoSimilarityError, Sim3, pose_similarity
 from gsba.store import cluster
-from gsba.store.folder import STAGES, is_run_folder, read_marker
+from gsba.store.folder import STAGES, check_run_folder, is_run_folder, read_marker
 from gsba.store.records import save_record
 from gsba.store.store import RunStore
 from gsba.trajectory.joining import PLACES, SegmentAlignment
@@ -58,8 +58,7 @@ def held_runs(roots: Sequence[Path]) -> Iterator[None]:
     locks = list[int]()
     try:
         for root in roots:
-            if not is_run_folder(root):
-                raise GsbaError(f"{root} is not a gsba run: give the folder that gsba refine wrote")
+            check_run_folder(root)
             locks.append(hold_folder(root))
         yield
     finally:

@@ -258,8 +258,8 @@ def refine_from(
             return _map_features(frontend.extract(run)).prior
 
         frames = start.frames
-        known = [chosen.carrier, chosen.distractors, start.evidence.digests()]
-        known.append(callable(chosen.segment) or chosen.segment)
+        segmented = callable(chosen.segment) or chosen.segment
+        known = [chosen.carrier, chosen.distractors, start.evidence.digests(), segmented]
         whole = densify.fetch_where_weak(store, source, walk, frames, settings, measure, known)
         start = start if whole is frames else Start.of(whole, given, settings)
     state, result = _in_order(

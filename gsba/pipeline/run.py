@@ -72,7 +72,7 @@ class Evidence:
     start: RunStart = RunStart.TRAJECTORY  # for the report
 
     def digests(self) -> list[object]:
-        """What tells the gyro and the families from others."""
+        """Digests of the gyro's measurements and of the families of residuals."""
         families = [(family.name, family.digest) for family in self.families]
         return [None if self.imu is None else self.imu.digest, families]
 

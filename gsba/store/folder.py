@@ -84,6 +84,12 @@ def is_run_folder(root: Path) -> bool:
     return (root / MARKER).is_file()
 
 
+def check_run_folder(root: Path) -> None:
+    """Raise GsbaError if the folder is not that of a run."""
+    if not is_run_folder(root):
+        raise GsbaError(f"{root} is not a gsba run: give the folder that gsba refine wrote")
+
+
 def refuse_foreign(root: Path) -> None:
     """Raise GsbaError for links and pipes in a run's folder and in that of its stages."""
     refuse_links(root.resolve())

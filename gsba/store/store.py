@@ -24,7 +24,7 @@ from pydantic import BaseModel
 from gsba.disk import FullDiskError, link_or_copy, write_text
 from gsba.log import GsbaError, brief, event
 from gsba.memory import give_back_freed_memory, peak_memory_bytes, release_mapped_files
-from gsba.store.folder import STAGES, claim, is_run_folder, open_run_folder, refuse_foreign
+from gsba.store.folder import STAGES, check_run_folder, claim, open_run_folder, refuse_foreign
 from gsba.store.records import (
     FORMAT,
     MIN_MAPPED_BYTES,
@@ -380,8 +380,7 @@ class _Missing:
 def load_stage(root: Path, name: str, returns: type[T]) -> T:
     """Result of a finished stage of a run with any settings; GsbaError if `root` is no gsba run or
     holds links, or the stage is missing or damaged."""
-    if not is_run_folder(root):
-        raise GsbaError(f"{root} is not a gsba run: give the folder that gsba refine wrote")
+    check_run_folder(root)
     refuse_foreign(root)
     try:
         return load_record(_stage_path(root, name), returns)

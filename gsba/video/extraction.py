@@ -67,7 +67,7 @@ class _Kept:
 
 @dataclass(frozen=True, slots=True)
 class Chosen:
-    """What the frames of an extraction were chosen by, where odometry chose them."""
+    """How odometry chose the frames of an extraction."""
 
     file: str  # name of the TUM file of their poses, beside their folder
     max_frames: int | None  # that were asked for
@@ -332,7 +332,7 @@ def _remove_images(out: Path, lenses: Sequence[str], names: Sequence[str]) -> No
 
 @dataclass(frozen=True, slots=True)
 class _Marker:
-    """What a folder of frames holds."""
+    """Content of `extract.json`, the marker of a folder of extracted frames, but for counts."""
 
     video: Path
     key: str
@@ -351,7 +351,7 @@ def _write_marker(out: Path, marker: _Marker, counts: Counts | None) -> None:
 
 
 def chosen_in(out: Path) -> Chosen | None:
-    """What the frames of an extraction were chosen by; None = no odometry chose them, or there is
+    """How odometry chose the frames of an extraction; None = it did not choose them, or there is
     no extraction. GsbaError: the folder holds something else."""
     if not (out.is_dir() and any(out.iterdir())):
         return None

@@ -135,7 +135,7 @@ def test_contract(
 
 
 def _shown(found: tuple[Features, Features], f0_T_f1: np.ndarray, gate: Gate = GATE) -> list[tuple]:
-    """What the network was shown."""
+    """Keypoints of both faces that the network gets."""
     shown = []
 
     def network(first, second, size):
