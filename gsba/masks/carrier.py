@@ -38,6 +38,8 @@ PICTURE_WIDTH = 512  # pixels across the pictures in which the outline is found
 _MIN_FRAMES = 6  # fewer agree by chance
 _MIN_FIXED_CORRELATION, _MAX_MOVING_CORRELATION = 0.75, 0.5  # least correlation of fixed structure;
 # largest of moving structure
+_MAX_STEADINESS_ABOVE = 0.25  # correlation above a carrier that turns: .06 to .08 on walks, .4 and
+# more where the camera sways on the spot, and the room is what turns
 VEHICLE_SHARE = 1 / 3  # share of the picture from which the carrier is a vehicle: people and sticks
 # fill less
 _STRUCTURE_WIDTH_PX, _TURNED_STRUCTURE_WIDTH_PX = 256, 128  # width in pixels of compared pictures:
@@ -208,9 +210,11 @@ def _measure_turned(pictures: np.ndarray) -> tuple[np.ndarray, FixedStructure] |
     coarse = _measure(turned, _TURNED_STRUCTURE_WIDTH_PX)
     if not certain_places(coarse).any():
         return None
-    as_taken = _measure(pictures, _TURNED_STRUCTURE_WIDTH_PX)
-    if _steadiness_above(coarse) > _steadiness_above(as_taken):
-        return None
+    above = _steadiness_above(coarse)
+    if above > _MAX_STEADINESS_ABOVE:
+        as_taken = _measure(pictures, _TURNED_STRUCTURE_WIDTH_PX)
+        if above > _steadiness_above(as_taken) / 2:  # a far world moves by the turns alone
+            return None
     fine = _measure(turned, _STRUCTURE_WIDTH_PX)
     return turned, fine if certain_places(fine).any() else coarse
 

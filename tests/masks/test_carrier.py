@@ -16,6 +16,9 @@ from two_fisheyes import colours, made_pair, picture, write
 
 from gsba import refine
 from gsba.camera.sphere import erp_directions, erp_from_bearings
+from gsba.demo.gallery import build_gallery
+from gsba.demo.render import render_erp
+from gsba.demo.walk import held_by_hand
 from gsba.disk import write_image
 from gsba.frames.scan import scan
 from gsba.log import GsbaError
@@ -301,4 +304,17 @@ def test_a_camera_that_turns_is_no_carrier_that_turns(tmp_path: Path) -> None:
         noisy = np.clip(turned + rng.normal(0, 2, turned.shape), 0, 255).astype(np.uint8)
         write_image(tmp_path / f"turn/{f:03d}.png", noisy)
     carrier = find_carrier(scan(tmp_path / "turn", order_suffices=True))
+    assert carrier.mask.all() and not carrier.turns.any()
+
+
+def test_a_camera_that_sways_on_the_spot_shows_no_carrier(tmp_path: Path) -> None:
+    """The hand turns it by a few degrees; the room stays once that is undone, and is no vehicle."""
+    angle = np.linspace(0, 2 * np.pi, 16, endpoint=False)
+    positions = np.stack([-4.4 + 0.06 * np.cos(angle), -1.5 + 0 * angle, 0.06 * np.sin(angle)], 1)
+    poses = held_by_hand(positions, 0.0, np.random.default_rng(0))
+    scene = build_gallery()
+    for f, world_T_rig in enumerate(poses.world_T_rigs):
+        grey_levels = np.clip(render_erp(scene, world_T_rig, WIDTH, HEIGHT), 0, 255)
+        write_image(tmp_path / f"sway/{f:03d}.png", grey_levels.astype(np.uint8))
+    carrier = find_carrier(scan(tmp_path / "sway", order_suffices=True))
     assert carrier.mask.all() and not carrier.turns.any()
