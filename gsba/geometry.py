@@ -143,6 +143,18 @@ def typical_length(lengths: np.ndarray) -> float:
     return float(np.median(walked)) if len(walked) else 1.0
 
 
+def standing_places(centres: np.ndarray) -> np.ndarray:
+    """Place (F,) int64, from 0, of each frame's centre (F, 3): consecutive frames in which the
+    camera stands (`standing_length`) are at one place, as views from there differ by noise."""
+    least = standing_length(np.linalg.norm(np.diff(centres, axis=0), axis=1))
+    places, first = np.zeros(len(centres), np.int64), 0
+    for f in range(1, len(centres)):
+        moved = np.linalg.norm(centres[f] - centres[first]) > least
+        first = f if moved else first
+        places[f] = places[f - 1] + moved
+    return places
+
+
 def furthest(positions: np.ndarray) -> tuple[int, float]:
     """Row of the position, of (N, 3), that is furthest from the first, and its distance."""
     distances = np.linalg.norm(positions - positions[0], axis=1)

@@ -24,6 +24,7 @@ from gsba.geometry import (
     relative_steps,
     rotation_angle,
     standing_length,
+    standing_places,
     step_covariances,
     typical_length,
 )
@@ -280,23 +281,31 @@ def step_motion(
 
 
 def overlap_ratios(result: Reconstruction, recordings: np.ndarray) -> np.ndarray:
-    """Overlap (F - 1,) of the two frames of each step over the expected one. Overlap: points that
-    both observe, part of all that either does. Expected: the smaller one of both steps beside it,
-    to the power of how many times as long the step is. NaN where that is hardly any, or where a
-    step beside it is missing or of another one of recordings (F,)."""
-    points = [np.unique(result.observation_points[rows]) for rows in result.observations_by_frame()]
+    """Overlap (F - 1,) of the two places of each step over the expected one. Places: frames, or
+    those in which the camera stands, which share out their points. Overlap: points that both
+    observe, part of all that either does. Expected: the smaller one of both steps beside it, to the
+    power of how many times as long the step is. NaN where that is hardly any, within a place, or
+    where a step beside it is missing or of another one of recordings (F,)."""
+    found = np.full(len(result.world_T_rigs) - 1, np.nan)
+    centres = result.world_T_rigs[:, :3, 3]
+    last = np.flatnonzero(np.diff(standing_places(centres)))  # frame before each step
+    frames = np.split(np.arange(len(centres)), last + 1)  # of each place
+    observed = result.observations_by_frame()
+    points = [
+        np.unique(result.observation_points[np.concatenate([observed[f] for f in place])])
+        for place in frames
+    ]
     common = [len(np.intersect1d(*two, assume_unique=True)) for two in pairwise(points)]
     each = np.array([len(some) for some in points])
     overlaps = common / np.maximum(each[:-1] + each[1:] - common, 1)
-    lengths = np.linalg.norm(np.diff(result.world_T_rigs[:, :3, 3], axis=0), axis=1)
-    found = np.full(len(overlaps), np.nan)
-    for step in range(1, len(overlaps) - 1):
+    lengths = np.linalg.norm(centres[last + 1] - centres[last], axis=1)
+    for step in range(1, len(last) - 1):
         beside = [step - 1, step + 1]
         times = max(lengths[step] / max(lengths[beside].max(), 1e-300), 1.0)
         expected = overlaps[beside].min() ** times
-        one_recording = len(set(recordings[step - 1 : step + 3].tolist())) == 1
-        if one_recording and expected > _MIN_OVERLAP:
-            found[step] = overlaps[step] / expected
+        around = recordings[np.concatenate(frames[step - 1 : step + 3])]
+        if len(set(around.tolist())) == 1 and expected > _MIN_OVERLAP:
+            found[last[step]] = overlaps[step] / expected
     return found
 
 

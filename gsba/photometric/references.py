@@ -3,7 +3,7 @@
 import numpy as np
 
 from factors.compiled import kernel_and_part
-from gsba.geometry import standing_length
+from gsba.geometry import standing_places
 from gsba.types import Landmarks
 
 _MAX_VIEWS = 16  # most places that a point is aligned at
@@ -38,7 +38,7 @@ def visible_frames(
     """
     centres = np.ascontiguousarray(world_T_rigs[:, :3, 3])
     frames, points = landmarks.tracks.frames, landmarks.points_world
-    places = _places(centres)
+    places = standing_places(centres)
     num_near = min(_NEAR_FRAMES, places[-1])
     near = np.empty((len(centres), num_near), np.int64)
     for f in np.unique(frames[rows]):
@@ -54,18 +54,6 @@ def visible_frames(
         extended, out,
     )  # fmt: skip
     return out[0, :num].copy(), out[1, :num].copy()
-
-
-def _places(centres: np.ndarray) -> np.ndarray:
-    """Place (F,) int64, from 0, of each frame's centre (F, 3): consecutive frames in which the
-    camera stands are at one place, as views from there differ by their noise alone."""
-    least = standing_length(np.linalg.norm(np.diff(centres, axis=0), axis=1))
-    places, first = np.zeros(len(centres), np.int64), 0
-    for f in range(1, len(centres)):
-        moved = np.linalg.norm(centres[f] - centres[first]) > least
-        first = f if moved else first
-        places[f] = places[f - 1] + moved
-    return places
 
 
 def view_differences(

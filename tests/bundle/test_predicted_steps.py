@@ -76,3 +76,19 @@ def test_frames_over_a_cut_have_far_less_in_common_than_those_beside() -> None:
     assert np.isnan(overlap_ratios(_walk(cut=6, step_at_cut=20.0), one)[5])  # none is
     two_recordings = (np.arange(NUM) >= 6).astype(int)
     assert np.isnan(overlap_ratios(_walk(cut=6), two_recordings)[4:7]).all()
+
+
+def test_frames_of_a_camera_that_stands_share_out_their_points() -> None:
+    """Each has few points in common with the frames beside it; their place has as many as usual."""
+    walk, place = _walk(cut=0), np.insert(np.arange(NUM), 6, [5, 5])  # of each frame, 5 thrice
+    rows = walk.observation_frames
+    shared = walk.observation_points % 3
+    frames = np.where(rows == 5, 5 + shared, rows + 2 * (rows > 5))
+    order = np.argsort(frames, kind="stable")
+    standing = map_of(
+        walk.world_T_rigs[place], walk.points_world, walk.observation_points[order], frames[order],
+        np.zeros((len(rows), 3)),
+    )  # fmt: skip
+    found = overlap_ratios(standing, np.zeros(len(place), np.int64))
+    assert np.nanmin(found) > 0.9
+    assert np.isnan(found[5:7]).all() and np.isfinite(found[[4, 7]]).all()
