@@ -25,7 +25,7 @@ from gsba.matching import correspondences, guided_search, pairs, recovery
 from gsba.matching.guided_search import PRIOR_GATE, MatchContext, SearchableFrames
 from gsba.matching.recovery import Recovered
 from gsba.matching.verification import relative_pose
-from gsba.pipeline import inputs
+from gsba.pipeline import blank_frames, inputs
 from gsba.pipeline.acceptance import NoPositions
 from gsba.pipeline.prior import Prior
 from gsba.pipeline.run import Run
@@ -58,14 +58,14 @@ _MIN_PATH_SHARE = 0.5  # of the whole path, that lies between them at least: sho
 
 def extract(run: Run) -> State:
     """Keypoints of all frames, the first state of a run; where its map is expected to be weak, as
-    many as weak frames get."""
+    many as weak frames get. BlankFramesError: frames without a trajectory show nothing."""
     drift, known = expected_drift(run, _search(run, run.settings))
     more = drift > run.settings.weak_frames.max_drift
     event("features", more=more)
     enlarged = _enlarged(run.settings)
     found = _extract(run, enlarged) if more else _extract(run, run.settings, known=known)
     observed = observe(run, "keypoints", [found] * len(run.frames), "features")
-    return State.begin(run, replace(observed, more=more))
+    return blank_frames.refuse(State.begin(run, replace(observed, more=more)))
 
 
 def _enlarged(settings: RefineSettings) -> RefineSettings:

@@ -68,7 +68,7 @@ class RunResult:
     @property
     def partial(self) -> bool:
         """Whether less than nine tenths of the frames are in the map that is exported."""
-        return is_partial(self.maps, len(self.frames))
+        return is_partial(self.maps, len(self.frames) + self.report["summary"]["frames_blank"])
 
     @property
     def failed(self) -> bool:
@@ -241,7 +241,7 @@ def _findings(state: State, result: Reconstruction, gps: dict[str, Any] | None) 
         found,
         recordings=recordings,
         reasons=_reasons(prior),
-        frame_lists=lists,
+        frame_lists={**lists, "blank": list(state.run.evidence.blank)},
         start=start,
         order_doubted=prior.order_doubted,
         lone_steps=prior.lone_steps,

@@ -3,10 +3,12 @@ poses, a cloud and datasets."""
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
+import numpy as np
 from threadpoolctl import threadpool_limits
 
 from gsba.bundle.families import Family
@@ -23,6 +25,7 @@ from gsba.photometric import direct
 from gsba.pipeline import (
     acceptance,
     backend,
+    blank_frames,
     camera,
     densify,
     each_recording,
@@ -36,7 +39,7 @@ from gsba.pipeline import (
 from gsba.pipeline.outputs import RunResult
 from gsba.pipeline.prior import Prior
 from gsba.pipeline.recordings import GivenRecording, Recording, names_of, with_camera, with_videos
-from gsba.pipeline.run import Evidence, Journal, Run
+from gsba.pipeline.run import Evidence, Journal, RecordingEvidence, Run
 from gsba.pipeline.stage_titles import title_of
 from gsba.pipeline.state import State
 from gsba.placement import check
@@ -234,6 +237,26 @@ class Start:
             families = (*made, *families[len(made) :])
         return replace(self, frames=frames, evidence=replace(self.evidence, families=families))
 
+    def without(self, names: tuple[str, ...], settings: RefineSettings) -> "Start":
+        """The start without frames that show nothing, which it lists."""
+        if not names:
+            return self
+        kept = np.array([name not in names for name in self.frames.names])
+        rows, recordings = np.flatnonzero(kept), list[RecordingEvidence]()
+        for one in self.evidence.recordings:
+            own = np.flatnonzero(kept[self.frames.recordings[one.name]])
+            recordings.append(replace(one, coarse=one.coarse.taken(own)))
+        left = self.on(self.frames.taken(rows), settings)
+        evidence = replace(left.evidence, recordings=tuple(recordings), blank=names)
+        return replace(left, coarse=self.coarse.taken(rows), evidence=evidence)
+
+    def ready(self, store: RunStore, settings: RefineSettings) -> "Start":
+        """The start as earlier attempts have found: without frames that show nothing, and stills
+        in their order."""
+        blank = blank_frames.known(store, self.frames, self.coarse, self.evidence, settings)
+        left = self.without(blank, settings)
+        return left.on(tour.in_known_order(store, left.frames, settings), settings)
+
 
 def refine_from(
     store: RunStore,
@@ -262,7 +285,7 @@ def refine_from(
         known = [chosen.carrier, chosen.distractors, start.evidence.digests(), segmented]
         whole = densify.fetch_where_weak(store, source, walk, frames, settings, measure, known)
         start = start if whole is frames else Start.of(whole, given, settings)
-    state, result = _in_order(
+    state, result = _attempted(
         lambda: _begin(store, settings, chosen, start),
         lambda run: _solve_or_turn(run, walk is not None),
     )
@@ -274,13 +297,13 @@ def refine_from(
     return written
 
 
-def _in_order(begin: Callable[[], Run], solution: Callable[[Run], T]) -> T:
-    """A run's solution; of stills in no order that of another run, which begins in the order that
-    the first one has found."""
-    try:
-        return solution(begin())
-    except tour.OrderFoundError:
-        return solution(begin())
+def _attempted(begin: Callable[[], Run], solution: Callable[[Run], T]) -> T:
+    """A run's solution; where a run finds that some frames show nothing, or the order of stills,
+    that of another run, which begins with what the first one has found."""
+    for _ in range(2):
+        with suppress(blank_frames.BlankFramesError, tour.OrderFoundError):
+            return solution(begin())
+    return solution(begin())
 
 
 def _solve_or_turn(run: Run, followed: bool) -> tuple[State, Reconstruction]:
@@ -312,7 +335,7 @@ def _begin(store: RunStore, settings: RefineSettings, chosen: merging.Choice, st
     journal, frames = Journal(), merging.before(store, start.frames, chosen)
     if chosen.distractors:
         frames = _without_distractors(store, settings, chosen, start.on(frames, settings), journal)
-    start = start.on(tour.in_known_order(store, frames, settings), settings)
+    start = start.on(frames, settings).ready(store, settings)
     return Run.begin(store, start.frames, start.coarse, settings, start.evidence, journal)
 
 
@@ -329,21 +352,22 @@ def _without_distractors(
     direct.check(start.frames, settings)  # before the first solution, not after
 
     def begin() -> Run:
-        first = start.on(tour.in_known_order(store, start.frames, plainer), settings)
+        first = start.ready(store, plainer)
         # Drift over the whole path does not show in what frames near one another do not explain.
         near = tuple(family for family in first.evidence.families if not family.limits_drift)
         evidence = replace(first.evidence, imu=None, families=near)
         return Run.begin(store, first.frames, first.coarse, plainer, evidence)
 
     with store.named("first"):
-        run, state = _in_order(begin, lambda run: (run, solve(frontend.extract(run))))
+        run, state = _attempted(begin, lambda run: (run, solve(frontend.extract(run))))
     if state.prior.turning_only:
         return start.frames
     first = f"first-{run.latest[0]}"
     masked, counts = merging.after(store, run.frames, chosen, state.solution, first)
     journal.note("distractors", counts)
-    masks = dict(zip(masked.names, masked.mask_paths, strict=True))
-    return replace(start.frames, mask_paths=tuple(masks[name] for name in start.frames.names))
+    masks = dict(zip(start.frames.names, start.frames.mask_paths, strict=True))
+    masks |= dict(zip(masked.names, masked.mask_paths, strict=True))
+    return replace(start.frames, mask_paths=tuple(masks.values()))
 
 
 def _solve_raw(run: Run) -> State:

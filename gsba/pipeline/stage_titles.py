@@ -26,6 +26,7 @@ _TITLES = {
     "clock": "check the trajectory's clock",
     "turn": "prove a turn on the spot",
     "steps": "check the trajectory's steps",
+    "blank": "list frames that show nothing",
     "likeness": "compare all stills",
     "order": "compare neighbours with other frames",
     "tour": "search stills along epipolar lines",

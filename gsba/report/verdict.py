@@ -31,7 +31,7 @@ _NO_START = {RunStart.PAIRS, "none"}  # sources of poses of a run that has no po
 class Figures:
     """Figures of the exported map. NaN = not known."""
 
-    frames: int  # of the run, without those that were fetched for the map alone
+    frames: int  # given, without those that were fetched for the map alone
     exported: int  # of these, in the exported map
     points: int
     # Part of the extent by which no position is further off, in 19 of 20 maps.
@@ -69,6 +69,7 @@ def measure(report: Mapping[str, Any], main: Reconstruction, shown: FrameSet) ->
     known = len(main.points_world) > 0 and extent > 0
     width = max(kind.panorama_width for kind in shown.formats)
     shifts = neighbour_shifts(main) * _ERROR_RATIO * width / (2 * np.pi)
+    counted = report["summary"]
     shifts, checks = shifts[np.isfinite(shifts)], report["trajectory"] or {}
     unknown = (math.nan,) * (len(shown) - 1)
     changes = moved = deviations = overlaps = unknown
@@ -80,7 +81,9 @@ def measure(report: Mapping[str, Any], main: Reconstruction, shown: FrameSet) ->
         deviations = tuple(step_deviations(main).tolist())
         overlaps = tuple(overlap_ratios(main, shown.recording_of_frame).tolist())
     return Figures(
-        frames=report["summary"]["frames"] - report["summary"].get("frames_fetched", 0),
+        frames=counted["frames"]
+        + counted.get("frames_blank", 0)
+        - counted.get("frames_fetched", 0),
         exported=len(shown.chosen()),
         points=len(main.points_world),
         position_error=_position_error(main) / extent if known else math.nan,
@@ -260,7 +263,11 @@ class _Tests:
     def _frames_out(self) -> Iterator[Reason]:
         """Frames that are not in the exported map."""
         exported, num = self.figures.exported, self.figures.frames
-        if exported == num:
+        if blank := tuple(self.report["frame_lists"].get("blank", ())):
+            cause = f"{len(blank)} of {num} frames show next to nothing, and are left out"
+            remedy = "the frames beside them hold the map together: give sharper or lighter ones"
+            yield Reason(Level.LOOK, blank, cause, remedy)
+        if exported + len(blank) == num:
             return
         inside = {*self.names, *self.report["frame_lists"].get("fetched", ())}
         out = tuple(row["name"] for row in self.report["frames"] if row["name"] not in inside)

@@ -131,7 +131,7 @@ def test_where_the_map_is_weak_is_measured_again_under_other_masks(
     monkeypatch.setattr(module.frontend, "extract", lambda frames: frames)
     solved = SimpleNamespace(prior=_prior(5, []))
     monkeypatch.setattr(module, "_map_features", lambda _: solved)
-    monkeypatch.setattr(module, "_in_order", far_enough)
+    monkeypatch.setattr(module, "_attempted", far_enough)
     extract(video, tmp_path / "frames", VideoSettings(fps=1))
     start = module.Start.of(scan(tmp_path / "frames"), Evidence(), SETTINGS)
     for masks in ("none", "auto", "auto"):

@@ -96,7 +96,7 @@ def test_the_report_tells_what_happened(case: Case) -> None:
     assert len(counts) > 10
     for counted in counts:  # whatever is dropped has a reason
         assert counted["received"] == counted["kept"] + sum(counted["dropped"].values()), counted
-    names = ("fetched", "interpolated", "unmatched", "weighted_down", "uncertain_scale")
+    names = ("fetched", "interpolated", "unmatched", "weighted_down", "uncertain_scale", "blank")
     assert report["frame_lists"] == {name: [] for name in names}
     first = report["solver"][0]["rounds"][0]["iterations"]
     assert first[-1]["cost"] < first[0]["cost"] and "bearing" in first[0]["costs"]

@@ -1,0 +1,45 @@
+"""A walk of which a covered lens, or a damaged video, leaves frames that show nothing."""
+
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+from tiny_run import NUM_FRAMES, PLAIN, WIDTH, Case, computed_stages
+
+from gsba import refine
+from gsba.evaluate.trajectory import evaluate
+from gsba.report.maps import format_outcome
+from gsba.trajectory.files import read_trajectory
+
+BLANK = "000003", "000005"
+
+
+def _walk(case: Case, to: Path) -> Path:
+    """The tiny walk with two black frames."""
+    shutil.copytree(case.frames, to)
+    for name in BLANK:
+        cv2.imwrite(str(to / f"{name}.jpg"), np.zeros((WIDTH // 2, WIDTH, 3), np.uint8))
+    return to
+
+
+def test_the_frames_beside_a_blank_one_are_neighbours(case: Case, tmp_path: Path) -> None:
+    frames, run = _walk(case, tmp_path / "walk"), tmp_path / "run"
+    result = refine(frames, None, run, PLAIN)
+    assert not {*BLANK} & {*result.frames.names} and len(result.frames) == NUM_FRAMES - len(BLANK)
+    assert result.report["summary"]["refined"] == NUM_FRAMES - len(BLANK)
+    assert evaluate(read_trajectory(run / "trajectory.tum"), case.truth).ate.rmse < 0.02
+    # They are counted and named.
+    assert result.partial and result.report["frame_lists"]["blank"] == [*BLANK]
+    (reason,) = (r for r in result.report["verdict"]["reasons"] if "next to nothing" in r["cause"])
+    assert reason["frames"] == [*BLANK] and reason["level"] != "good to train"
+    assert f"6 of {NUM_FRAMES} frames refined (2 show nothing)" in format_outcome(
+        result.report, run
+    )
+    assert not computed_stages(refine(frames, None, run, PLAIN))
+
+
+def test_a_trajectory_gives_a_blank_frame_a_pose(case: Case, tmp_path: Path) -> None:
+    result = refine(_walk(case, tmp_path / "walk"), case.slam, tmp_path / "run", PLAIN)
+    assert len(result.frames) == NUM_FRAMES and not result.report["frame_lists"]["blank"]
+    assert result.report["frame_lists"]["unmatched"] == [*BLANK]
