@@ -25,7 +25,7 @@ from gsba.matching import correspondences, guided_search, pairs, recovery
 from gsba.matching.guided_search import PRIOR_GATE, MatchContext, SearchableFrames
 from gsba.matching.recovery import Recovered
 from gsba.matching.verification import relative_pose
-from gsba.pipeline import blank_frames, inputs
+from gsba.pipeline import inputs, unusable_frames
 from gsba.pipeline.acceptance import NoPositions
 from gsba.pipeline.prior import Prior
 from gsba.pipeline.run import Run
@@ -58,14 +58,14 @@ _MIN_PATH_SHARE = 0.5  # of the whole path, that lies between them at least: sho
 
 def extract(run: Run) -> State:
     """Keypoints of all frames, the first state of a run; where its map is expected to be weak, as
-    many as weak frames get. BlankFramesError: frames without a trajectory show nothing."""
+    many as weak frames get. UnusableFramesError: see `unusable_frames`."""
     drift, known = expected_drift(run, _search(run, run.settings))
     more = drift > run.settings.weak_frames.max_drift
     event("features", more=more)
     enlarged = _enlarged(run.settings)
     found = _extract(run, enlarged) if more else _extract(run, run.settings, known=known)
     observed = observe(run, "keypoints", [found] * len(run.frames), "features")
-    return blank_frames.refuse(State.begin(run, replace(observed, more=more)))
+    return unusable_frames.refuse_blank(State.begin(run, replace(observed, more=more)))
 
 
 def _enlarged(settings: RefineSettings) -> RefineSettings:
@@ -188,11 +188,12 @@ def _match_neighbours(state: State, name: str) -> State:
 
 def check_steps(state: State) -> Recovered:
     """Neighbours with and without the trajectory's guidance, and its steps by these; GsbaError if
-    images contradict most of it."""
+    images contradict most of it. UnusableFramesError: see `unusable_frames`."""
     run, prior, times = state.run, state.prior, state.run.frames.timestamps
     context = state.observed.context
     compute = partial(recovery.recover, context, state.verified, prior.coarse, times)
-    return run.stage("steps", [run.matching_key(), run.settings.priors], compute, Recovered)
+    found = run.stage("steps", [run.matching_key(), run.settings.priors], compute, Recovered)
+    return unusable_frames.refuse_odd(state, found)
 
 
 def judge_trajectory(state: State, found: Recovered) -> State:

@@ -68,7 +68,7 @@ class RunResult:
     @property
     def partial(self) -> bool:
         """Whether less than nine tenths of the frames are in the map that is exported."""
-        return is_partial(self.maps, len(self.frames) + self.report["summary"]["frames_blank"])
+        return is_partial(self.maps, len(self.frames) + self.report["summary"]["frames_unusable"])
 
     @property
     def failed(self) -> bool:
@@ -241,7 +241,7 @@ def _findings(state: State, result: Reconstruction, gps: dict[str, Any] | None) 
         found,
         recordings=recordings,
         reasons=_reasons(prior),
-        frame_lists={**lists, "blank": list(state.run.evidence.blank)},
+        frame_lists={**lists, "unusable": list(state.run.evidence.unusable)},
         start=start,
         order_doubted=prior.order_doubted,
         lone_steps=prior.lone_steps,

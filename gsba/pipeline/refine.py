@@ -25,7 +25,6 @@ from gsba.photometric import direct
 from gsba.pipeline import (
     acceptance,
     backend,
-    blank_frames,
     camera,
     densify,
     each_recording,
@@ -35,6 +34,7 @@ from gsba.pipeline import (
     outputs,
     patch_rounds,
     tour,
+    unusable_frames,
 )
 from gsba.pipeline.outputs import RunResult
 from gsba.pipeline.prior import Prior
@@ -238,7 +238,7 @@ class Start:
         return replace(self, frames=frames, evidence=replace(self.evidence, families=families))
 
     def without(self, names: tuple[str, ...], settings: RefineSettings) -> "Start":
-        """The start without frames that show nothing, which it lists."""
+        """The start without unusable frames, which it lists."""
         if not names:
             return self
         kept = np.array([name not in names for name in self.frames.names])
@@ -247,14 +247,14 @@ class Start:
             own = np.flatnonzero(kept[self.frames.recordings[one.name]])
             recordings.append(replace(one, coarse=one.coarse.taken(own)))
         left = self.on(self.frames.taken(rows), settings)
-        evidence = replace(left.evidence, recordings=tuple(recordings), blank=names)
+        evidence = replace(left.evidence, recordings=tuple(recordings), unusable=names)
         return replace(left, coarse=self.coarse.taken(rows), evidence=evidence)
 
     def ready(self, store: RunStore, settings: RefineSettings) -> "Start":
-        """The start as earlier attempts have found: without frames that show nothing, and stills
-        in their order."""
-        blank = blank_frames.known(store, self.frames, self.coarse, self.evidence, settings)
-        left = self.without(blank, settings)
+        """The start as earlier attempts have found: without unusable frames, and stills in their
+        order."""
+        known = unusable_frames.known(store, self.frames, self.coarse, self.evidence, settings)
+        left = self.without(known, settings)
         return left.on(tour.in_known_order(store, left.frames, settings), settings)
 
 
@@ -298,10 +298,10 @@ def refine_from(
 
 
 def _attempted(begin: Callable[[], Run], solution: Callable[[Run], T]) -> T:
-    """A run's solution; where a run finds that some frames show nothing, or the order of stills,
-    that of another run, which begins with what the first one has found."""
-    for _ in range(2):
-        with suppress(blank_frames.BlankFramesError, tour.OrderFoundError):
+    """A run's solution; where a run finds unusable frames, or the order of stills, that of another
+    run, which begins with what the first one has found."""
+    for _ in range(3):  # frames without keypoints, without matches, and the order
+        with suppress(unusable_frames.UnusableFramesError, tour.OrderFoundError):
             return solution(begin())
     return solution(begin())
 

@@ -101,12 +101,12 @@ def format_frame_counts(report: Mapping[str, Any]) -> str:
         f"with the pose of the {start}": number("exported") - number("refined"),
         f"in {where}": number("frames_in_other_maps"),
         "in no map": number("frames_in_no_map"),
-        "show nothing": number("frames_blank"),
+        "unusable": number("frames_unusable"),
         "more strengthened the map, and datasets skip them": number("fetched"),
     }
     parts = [f"{count} {where}" for where, count in counts.items() if count]
     refined = number("refined") - number("fetched")
-    frames = number("frames") + number("frames_blank") - number("frames_fetched")
+    frames = number("frames") + number("frames_unusable") - number("frames_fetched")
     text = f"{refined} of {frames} frames refined"
     return f"{text} ({', '.join(parts)})" if parts else text
 

@@ -161,7 +161,7 @@ def build_report(
             "frames_in_no_map": np.count_nonzero(numbers == 0),
             "fetched": np.count_nonzero(shown.fetched),
             "frames_fetched": np.count_nonzero(frames.fetched),
-            "frames_blank": len(found.frame_lists.get("blank", ())),
+            "frames_unusable": len(found.frame_lists.get("unusable", ())),
             "points": len(main.points_world),
             "observations": len(residuals),
             "mean_track_length": lengths.mean() if len(lengths) else math.nan,

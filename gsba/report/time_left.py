@@ -24,7 +24,7 @@ logger = logging.getLogger(__name__)
 PHASES = (
     r"carrier\d*|segmented|distractors\d*|masks|frames|expected_drift|fetch\d+|recut.*",
     r"features|keypoints",
-    r"blank|neighbours.*|clock|turn|steps|likeness|order|(features|keypoints)_tour|imu|gauge",
+    r"(blank|odd)_frames|neighbours.*|clock|turn|steps|likeness|order|(features|keypoints)_tour|imu|gauge",
     r"chain2?|adjacent|near|dense",
     r"registered|across\w*|similarities|joined|adjacent2|loops2?|places|gauge_closed|closed"
     r"|imu_closed",

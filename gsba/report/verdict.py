@@ -82,7 +82,7 @@ def measure(report: Mapping[str, Any], main: Reconstruction, shown: FrameSet) ->
         overlaps = tuple(overlap_ratios(main, shown.recording_of_frame).tolist())
     return Figures(
         frames=counted["frames"]
-        + counted.get("frames_blank", 0)
+        + counted.get("frames_unusable", 0)
         - counted.get("frames_fetched", 0),
         exported=len(shown.chosen()),
         points=len(main.points_world),
@@ -263,11 +263,14 @@ class _Tests:
     def _frames_out(self) -> Iterator[Reason]:
         """Frames that are not in the exported map."""
         exported, num = self.figures.exported, self.figures.frames
-        if blank := tuple(self.report["frame_lists"].get("blank", ())):
-            cause = f"{len(blank)} of {num} frames show next to nothing, and are left out"
-            remedy = "the frames beside them hold the map together: give sharper or lighter ones"
-            yield Reason(Level.LOOK, blank, cause, remedy)
-        if exported + len(blank) == num:
+        if unusable := tuple(self.report["frame_lists"].get("unusable", ())):
+            cause = (
+                f"{len(unusable)} of {num} frames show next to nothing, or nothing of what both "
+                "frames beside them show, and are left out"
+            )
+            remedy = "see whether the lens was covered, the picture is blurred or the file damaged"
+            yield Reason(Level.LOOK, unusable, cause, remedy)
+        if exported + len(unusable) == num:
             return
         inside = {*self.names, *self.report["frame_lists"].get("fetched", ())}
         out = tuple(row["name"] for row in self.report["frames"] if row["name"] not in inside)

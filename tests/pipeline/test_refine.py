@@ -96,7 +96,7 @@ def test_the_report_tells_what_happened(case: Case) -> None:
     assert len(counts) > 10
     for counted in counts:  # whatever is dropped has a reason
         assert counted["received"] == counted["kept"] + sum(counted["dropped"].values()), counted
-    names = ("fetched", "interpolated", "unmatched", "weighted_down", "uncertain_scale", "blank")
+    names = ("fetched", "interpolated", "unmatched", "weighted_down", "uncertain_scale", "unusable")
     assert report["frame_lists"] == {name: [] for name in names}
     first = report["solver"][0]["rounds"][0]["iterations"]
     assert first[-1]["cost"] < first[0]["cost"] and "bearing" in first[0]["costs"]
@@ -105,7 +105,7 @@ def test_the_report_tells_what_happened(case: Case) -> None:
 @pytest.fixture(scope="module")
 def blank(case: Case, tmp_path_factory: pytest.TempPathFactory) -> Case:
     """The walk with frame 3 grey."""
-    folder = tmp_path_factory.mktemp("blank")
+    folder = tmp_path_factory.mktemp("unusable")
     frames = _greyed(case, folder / "frames", [3])
     result = refine(frames, case.slam, folder / "run", ONE_ROUND)
     return replace(case, frames=frames, out=folder / "run", result=result)

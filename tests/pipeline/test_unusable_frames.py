@@ -1,4 +1,4 @@
-"""A walk of which a covered lens, or a damaged video, leaves frames that show nothing."""
+"""A walk with frames that cannot be matched, as a covered lens or a damaged video leaves them."""
 
 import shutil
 from pathlib import Path
@@ -30,16 +30,14 @@ def test_the_frames_beside_a_blank_one_are_neighbours(case: Case, tmp_path: Path
     assert result.report["summary"]["refined"] == NUM_FRAMES - len(BLANK)
     assert evaluate(read_trajectory(run / "trajectory.tum"), case.truth).ate.rmse < 0.02
     # They are counted and named.
-    assert result.partial and result.report["frame_lists"]["blank"] == [*BLANK]
+    assert result.partial and result.report["frame_lists"]["unusable"] == [*BLANK]
     (reason,) = (r for r in result.report["verdict"]["reasons"] if "next to nothing" in r["cause"])
     assert reason["frames"] == [*BLANK] and reason["level"] != "good to train"
-    assert f"6 of {NUM_FRAMES} frames refined (2 show nothing)" in format_outcome(
-        result.report, run
-    )
+    assert f"6 of {NUM_FRAMES} frames refined (2 unusable)" in format_outcome(result.report, run)
     assert not computed_stages(refine(frames, None, run, PLAIN))
 
 
 def test_a_trajectory_gives_a_blank_frame_a_pose(case: Case, tmp_path: Path) -> None:
     result = refine(_walk(case, tmp_path / "walk"), case.slam, tmp_path / "run", PLAIN)
-    assert len(result.frames) == NUM_FRAMES and not result.report["frame_lists"]["blank"]
+    assert len(result.frames) == NUM_FRAMES and not result.report["frame_lists"]["unusable"]
     assert result.report["frame_lists"]["unmatched"] == [*BLANK]

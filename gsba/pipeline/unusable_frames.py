@@ -1,0 +1,115 @@
+"""Frames that cannot be matched, as behind a covered lens, blurred, or of a damaged video.
+
+Where images alone tell how the camera moved, such a frame would part the walk in two: it is left
+out, and the frames beside it are neighbours. A trajectory gives it a pose, so that it stays.
+"""
+
+import logging
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from gsba.config import RefineSettings
+from gsba.log import GsbaError
+from gsba.matching import recovery
+from gsba.matching.recovery import Recovered
+from gsba.pipeline.run import Evidence
+from gsba.pipeline.state import State
+from gsba.report.findings import named
+from gsba.store.store import RunStore, fingerprint
+from gsba.types import CoarsePoses, FrameSet
+
+logger = logging.getLogger(__name__)
+
+_BLANK, _ODD = "blank_frames", "odd_frames"  # stages
+_MIN_KEYPOINTS = 12  # of a frame: with fewer no pair of frames is verified
+_MIN_FRAMES = 3  # that are left
+
+
+@dataclass(frozen=True, slots=True)
+class UnusableFrames:
+    """Result of either stage."""
+
+    names: tuple[str, ...]
+
+
+class UnusableFramesError(GsbaError):
+    """Some frames cannot be matched: the run has to begin again without them."""
+
+
+def refuse_blank(state: State) -> State:
+    """The first state of a run. UnusableFramesError: frames without a trajectory show next to
+    nothing."""
+    run, frames = state.run, state.run.frames
+    few = np.diff(state.observed.keypoints.starts) < _MIN_KEYPOINTS
+    few &= _without_trajectory(frames, run.coarse, run.evidence)
+    if few.any() and np.count_nonzero(~few) >= _MIN_FRAMES:
+        _refuse(state, _BLANK, "show next to nothing", lambda: np.flatnonzero(few))
+    return state
+
+
+def refuse_odd(state: State, found: Recovered) -> Recovered:
+    """The steps of a run. UnusableFramesError: frames match neither of their neighbours, though
+    these match one another; not asked of one of several recordings."""
+    seen = np.r_[True, ~found.trust.unseen_steps, True]  # (F + 1,) the steps before each frame
+    alone = 1 + np.flatnonzero(seen[:-3] & ~seen[1:-2] & ~seen[2:-1] & seen[3:])
+    if found.trust.turning_only or not state.prior.absent or state.run.suffix or not len(alone):
+        return found
+
+    def compute() -> np.ndarray:
+        over = np.column_stack([alone - 1, alone + 1]).astype(np.int32)
+        matched = recovery.match_anywhere(state.observed.context, over)
+        return matched.matches.pairs[:, 0] + 1
+
+    _refuse(state, _ODD, "match neither of their neighbours, which match one another", compute)
+    return found
+
+
+def _refuse(state: State, stage: str, what: str, compute: Callable[[], np.ndarray]) -> None:
+    """UnusableFramesError: a stage finds such frames, which the next attempt knows of."""
+    store, frames = state.run.store, state.run.frames
+
+    def find() -> UnusableFrames:
+        return UnusableFrames(tuple(frames.names[f] for f in compute()))
+
+    key = _key(frames, state.run.settings)
+    if names := store.stage(stage, key, find, UnusableFrames).names:
+        few = named(names, "frame_lists.unusable", f"of {len(frames)} frames")
+        logger.warning("frames that %s are left out: %s", what, few)
+        raise UnusableFramesError(f"some frames {what}")
+
+
+def known(
+    store: RunStore,
+    frames: FrameSet,
+    coarse: CoarsePoses,
+    evidence: Evidence,
+    settings: RefineSettings,
+) -> tuple[str, ...]:
+    """Names of the frames that earlier attempts on all these have found unusable."""
+    names = tuple[str, ...]()
+    if not _without_trajectory(frames, coarse, evidence).any():
+        return names
+    for stage in _BLANK, _ODD:
+        left = np.flatnonzero([name not in names for name in frames.names])
+        found = store.stored(stage, _key(frames.taken(left), settings), UnusableFrames)
+        names += () if found is None else found.names
+    return names
+
+
+def _without_trajectory(frames: FrameSet, coarse: CoarsePoses, evidence: Evidence) -> np.ndarray:
+    """True (F,) for frames whose recording has no trajectory."""
+    alone = np.full(len(frames), coarse.absent and not evidence.recordings)
+    for one in evidence.recordings:
+        alone[frames.recordings[one.name]] = one.coarse.absent
+    return alone
+
+
+def _key(frames: FrameSet, settings: RefineSettings) -> object:
+    """All that keypoints and their matches rest on, whatever the order of stills is."""
+    files = zip(frames.names, frames.paths, frames.mask_paths, strict=True)
+    each = [(name, fingerprint(paths), fingerprint([mask])) for name, paths, mask in files]
+    kinds, times = [*map(asdict, frames.formats)], frames.timestamps.tolist() * frames.timed
+    how = settings.features, settings.cubemap, settings.matching, settings.pairs, settings.seed
+    return sorted(each), kinds, times, how, settings.gate_factor
