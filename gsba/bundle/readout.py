@@ -151,7 +151,9 @@ def _of_few_frames(
     if reason:
         return CameraEstimate(lenses, gains=verdicts[best].shares, reason=reason, counts=counts)
     own = frame_step(models[best], sigmas).reshape(len(velocity), -1)[:, 6:]
-    taken = replace(lenses, row_directions=ways[best], readout_motion=own)
+    # Rows read the other way, and the reversed motion, show the same: frames move by their velocity
+    sign = -1.0 if np.sum(own[:, 3:] * velocity[:, 3:]) < 0 else 1.0
+    taken = replace(lenses, row_directions=sign * ways[best], readout_motion=sign * own)
     return replace(found, lenses=taken, gains=verdicts[best].shares)
 
 

@@ -174,9 +174,9 @@ def _of_few(world: World, shown: Keypoints, few_frames: bool = True) -> tuple:
 
 
 @pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("up", [1.0, -1.0])
-def test_few_raw_frames_show_their_own_motion(seed: int, up: float) -> None:
-    way = DOWN * [[1.0], [up]]
+@pytest.mark.parametrize("signs", [(1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0)])
+def test_few_raw_frames_show_their_own_motion(seed: int, signs: tuple[float, float]) -> None:
+    way = DOWN * np.array(signs)[:, None]
     swept = replace(RAW, row_directions=way, readout_motion=FEW_MOTION)
     world, shown = seen_through(swept, seed, FEW_POSES, FEW)
     _, _, untold = _of_few(world, shown, few_frames=False)
@@ -186,6 +186,7 @@ def test_few_raw_frames_show_their_own_motion(seed: int, up: float) -> None:
     np.testing.assert_allclose(found.lenses.row_directions, way, atol=1e-9)
     solved, found = solved_with(world, shown, found, solved, problem)
     assert readout.without_vanished(found) is found and found.lenses.readout_motion is not None
+    assert found.readout_s == pytest.approx(READOUT_S, rel=0.2)
     left = np.sqrt(np.mean((found.lenses.readout_motion - FEW_MOTION)[:, :3] ** 2))
     assert left < 0.4 * np.sqrt(np.mean(FEW_MOTION[:, :3] ** 2))
     assert solved.noise < 1.1
