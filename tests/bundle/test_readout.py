@@ -192,6 +192,33 @@ def test_few_raw_frames_show_their_own_motion(seed: int, signs: tuple[float, flo
     assert solved.noise < 1.1
 
 
+@pytest.mark.parametrize("num", [FEW, 24])
+@pytest.mark.parametrize("signs", [(1.0, 1.0), (-1.0, -1.0)])
+def test_raw_lenses_are_read_as_settings_say(signs: tuple[float, float], num: int) -> None:
+    """They named the way that a lens is read from the bottom up, and were said to be contradicted;
+    where they named another, nothing was."""
+    way, few = DOWN * np.array(signs)[:, None], num == FEW
+    moved = FEW_MOTION if few else TWISTS
+    swept = replace(RAW, row_directions=way, readout_motion=moved)
+    world, shown = seen_through(swept, 0, loop_walk(24)[:num], num)
+    start = Solution.without_points(world.world_T_rigs)
+    solved, keypoints, tracks = solved_under(world, shown, RAW, start)
+    around, problem = placed(solved, keypoints, tracks), problem_of(world)
+    for said in ("+y", "-y"):
+        camera = CameraSettings(sweep=(said, said))
+        settings = problem.settings.model_copy(update={"camera": camera})
+        context = replace(problem, settings=settings, cameras=())
+        given = keypoints, context, RAW, shown.bearings_rig, times(num)
+        rays = ObservedRays(replace(solved, landmarks=around), *given)
+        found = readout.estimate(rays, few)
+        if (said == "+y") == (signs[0] > 0):
+            assert not found.reason and found.lenses.row_directions is not None
+            np.testing.assert_allclose(found.lenses.row_directions, way, atol=1e-9)
+        else:
+            assert found.reason == "rows are read the other way than camera.sweep says"
+            assert found.lenses is RAW
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_few_raw_frames_of_one_instant_have_no_readout(seed: int) -> None:
     _, _, found = _of_few(*seen_through(RAW, seed, FEW_POSES, FEW))
