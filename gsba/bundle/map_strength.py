@@ -250,26 +250,36 @@ def _resected(result: Reconstruction, frame: int, rows: np.ndarray) -> np.ndarra
 
 
 def step_motion(
-    before_T_rigs: np.ndarray, world_T_rigs: np.ndarray, covariances: np.ndarray, joint: JointErrors
+    before_T_rigs: np.ndarray,
+    world_T_rigs: np.ndarray,
+    covariances: np.ndarray,
+    joint: JointErrors,
+    components: np.ndarray | None = None,
 ) -> float:
     """Motion of the steps from frame to frame in their own standard deviations, rms: sqrt(mean(d^T
     C^-1 d) / 6) over all steps of known covariance C; NaN where there is none.
 
     Args:
-        before_T_rigs, world_T_rigs: (F, 4, 4) poses before the round, in a world of any scale,
-            and after it.
+        before_T_rigs, world_T_rigs: (F, 4, 4) poses before the round, each map in a world of any
+            scale, and after it.
         covariances: (F, 6, 6) of these [rotation rad, translation], rig frames; NaN = not
             known.
+        components: (F,) map of each frame, None = there is one; a step from one to another is none.
     """
     steps, former = relative_steps(world_T_rigs), relative_steps(before_T_rigs)
-    length, was = (np.linalg.norm(some[:, :3, 3], axis=1).sum() for some in (steps, former))
-    former[:, :3, 3] *= length / max(was, 1e-300)
+    maps = numbered(components, len(world_T_rigs))
+    within, owners = maps[1:] == maps[:-1], maps[:-1]
+    length, was = (
+        np.bincount(owners, within * np.linalg.norm(some[:, :3, 3], axis=1), maps.max() + 1)
+        for some in (steps, former)
+    )
+    former[:, :3, 3] *= (length / np.maximum(was, 1e-300))[owners, None]
     motion = inverse(former) @ steps
     tangents = np.column_stack(
         [Rotation.from_matrix(motion[:, :3, :3]).as_rotvec(), motion[:, :3, 3]]
     )
     spread = step_covariances(world_T_rigs, covariances, joint.neighbours)
-    known = np.isfinite(spread).all(axis=(1, 2))
+    known = within & np.isfinite(spread).all(axis=(1, 2))
     if not known.any():
         return np.nan
     # Radians and map units apart by orders of magnitude: each by its own standard deviation first.

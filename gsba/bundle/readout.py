@@ -33,6 +33,7 @@ logger = logging.getLogger(__name__)
 _MIN_SIGMAS = 4.0  # least duration that is taken, in its standard deviations
 LIKELY = 0.016, 0.008  # s, readout time of a video's frame, and its standard deviation
 VANISHED = "it vanishes where each frame's own motion is adjusted beside it"
+_OTHER_WAY = "rows are read the other way than camera.sweep says"
 TWO_INSTANTS = "the lenses may as well have taken their pictures at two instants"
 _AXES = np.eye(3)[:2]
 
@@ -108,8 +109,8 @@ def estimate(rays: ObservedRays, few_frames: bool = False) -> CameraEstimate:
     others = [other for way, other in enumerate(verdicts) if way != best]
     if not all(predicts(verdict.gains - other.gains) for other in others):
         return replace(found, reason="rows may be read in other directions as well")
-    if context.settings.camera.sweep is not None and duration < 0:
-        return replace(found, reason="rows are read the other way than camera.sweep says")
+    if duration < 0 and _said_way(context.settings.camera, lenses) is not None:
+        return replace(found, reason=_OTHER_WAY)
     readout_motion = abs(duration) * motion
     return replace(
         found,
@@ -151,7 +152,11 @@ def _of_few_frames(
     if reason:
         return CameraEstimate(lenses, gains=verdicts[best].shares, reason=reason, counts=counts)
     own = frame_step(models[best], sigmas).reshape(len(velocity), -1)[:, 6:]
-    taken = replace(lenses, row_directions=ways[best], readout_motion=own)
+    # Rows read the other way, and the reversed motion, show the same: frames move by their velocity
+    sign = -1.0 if np.sum(own[:, 3:] * velocity[:, 3:]) < 0 else 1.0
+    if sign < 0 and _said_way(rays.context.settings.camera, lenses) is not None:
+        return CameraEstimate(lenses, gains=verdicts[best].shares, reason=_OTHER_WAY, counts=counts)
+    taken = replace(lenses, row_directions=sign * ways[best], readout_motion=sign * own)
     return replace(found, lenses=taken, gains=verdicts[best].shares)
 
 
@@ -225,16 +230,23 @@ def velocities(
     return np.hstack([rates, local / span])
 
 
+def _said_way(camera: CameraSettings, lenses: Lenses) -> np.ndarray | None:
+    """Row directions (2, 3) that settings name; None = they name none of these lenses."""
+    if camera.sweep is None or lenses.num_lenses != len(camera.sweep):
+        return None
+    named = {"+x": _AXES[0], "-x": -_AXES[0], "+y": _AXES[1], "-y": -_AXES[1]}
+    return np.array([named[way] for way in camera.sweep])
+
+
 def _ways(camera: CameraSettings, lenses: Lenses) -> list[np.ndarray]:
     """Row directions (L, 3) that lenses may have, up to all of them reversed."""
-    num = lenses.num_lenses
+    num, said = lenses.num_lenses, _said_way(camera, lenses)
+    if said is not None:
+        return [said]
     signs = [np.array([[1.0, *rest]]).T for rest in product((1.0, -1.0), repeat=num - 1)]
     if lenses.reference_calibration is not None:
         down = rows_run(lenses.reference_calibration)
         return [sign * down for sign in signs]
-    if camera.sweep is not None:
-        named = {"+x": _AXES[0], "-x": -_AXES[0], "+y": _AXES[1], "-y": -_AXES[1]}
-        return [np.array([named[way] for way in camera.sweep])]
     if camera.lens_yaws_deg is not None:  # of one make: all read along their own right or down
         down = np.tile(_AXES[1], (num, 1))
         right = np.cross(down, lenses.optical_axes)

@@ -18,6 +18,7 @@ from gsba.types import Matches
 
 _LOSS_DEG = 0.2  # scale of the robust loss: points of two maps have correlated errors
 _MIN_COMMON_POINTS = 6  # least common inliers of two frames that propose a similarity
+_MIN_MEETINGS = 3  # least number of meetings by which a covariance is known
 _BESIDE = 3  # frames to either side of a meeting whose points it may count
 _MOST_POINTS = 20000  # of all meetings, by which similarities are compared
 
@@ -190,15 +191,17 @@ def similarity_covariance(meetings: list[Meeting], move: Sim3, poses: np.ndarray
     about its translation.
 
     Points of one meeting have common errors: residuals count as correlated within a meeting, and
-    as independent between meetings (Liang and Zeger, Biometrika 73(1), 1986).
+    as independent between meetings (Liang and Zeger, Biometrika 73(1), 1986). NaN where fewer than
+    three have inliers: the similarity fits the common errors of so few.
     """
-    step, about, every = 1e-6, move.translation, _inliers_of(meetings, move, poses)
+    step, about = 1e-6, move.translation
+    every = [one for one in _inliers_of(meetings, move, poses) if len(one.own)]
+    if len(every) < _MIN_MEETINGS:
+        return np.full((7, 7), np.nan)
     normal, scores = np.zeros((7, 7)), np.zeros((7, 7))
     for meeting in every:
         residuals = _residuals_of([meeting], poses)
         found = residuals(move)
-        if not len(found):
-            continue
         columns = [
             (residuals(move.moved(x, about)) - residuals(move.moved(-x, about))) / (2 * step)
             for x in step * np.eye(7)

@@ -219,8 +219,8 @@ def _solve(
             break
         weights = doubts
     accepted = landmarks.error(result.values) <= _MAX_GROWTH * before
-    solved = replace(solved, variables=terms.own.variables(result.values)) if accepted else solved
-    adjusted = _adjusted(solved, keypoints, result, accepted, context.num_threads)
+    after = replace(solved, variables=terms.own.variables(result.values))
+    adjusted = _adjusted((solved, after), keypoints, result, accepted, context.num_threads)
     return adjusted, weights, residuals
 
 
@@ -316,19 +316,25 @@ def _frame_weights(
 
 
 def _adjusted(
-    solved: Solution, keypoints: Keypoints, result: OptimizeResult, accepted: bool, num_threads: int
+    both: tuple[Solution, Solution],
+    keypoints: Keypoints,
+    result: OptimizeResult,
+    accepted: bool,
+    num_threads: int,
 ) -> Solution:
-    """The solution with the joint solve's poses, or the old one if not accepted.
+    """The solution with the joint solve's poses, or the old one if not accepted; `both`: the old
+    one, and that with the variables of the joint solve.
 
     Points are triangulated again as after a bundle adjustment: those of the solve are closer to
     most observations than noise permits.
     """
+    solved, moved = both
     tracks, least = solved.landmarks.tracks, MIN_OBSERVATIONS
     gate = solved.rounds[-1].gate_sigmas if solved.rounds else np.inf
     poses = adjustment.poses_of(result.values, len(solved.world_T_rigs))
     limit = gate * solved.noise
     placed = triangulation.place(tracks, keypoints, poses, limit, num_threads)
-    after = replace(solved, world_T_rigs=poses, landmarks=placed)
+    after = replace(moved, world_T_rigs=poses, landmarks=placed)
     accepted &= after.carries(solved, least)
     support = len(placed.tracks)
     note = Round(

@@ -159,7 +159,8 @@ def is_settled(before: State, state: State, number: int) -> bool:
         keypoints, context = state.map.keypoints(run.rig), state.adjustment_context()
         covariances, joint = adjustment.pose_covariances(solution, keypoints, context, prior.parts)
         former = before.solution.world_T_rigs
-        moved = map_strength.step_motion(former, solution.world_T_rigs, covariances, joint)
+        poses = former, solution.world_T_rigs
+        moved = map_strength.step_motion(*poses, covariances, joint, prior.parts)
         logger.debug("aligned %d times, steps moved by %.2f sigma", number - 1, moved)
         return moved
 

@@ -114,7 +114,8 @@ def _maps(
             piece, begin = "recording", f"recording {first.rpartition('/')[0]}"
         alignment = f"joined by {joint.how}, scale {joint.scale:.4g}"
         if joint.covariance is not None:
-            alignment += f" (sigma {100 * np.sqrt(joint.covariance[6, 6]):.2g} %)"
+            sigma = 100 * float(np.sqrt(joint.covariance[6, 6]))
+            alignment += f" (sigma {f'{sigma:.2g} %' if np.isfinite(sigma) else 'not known'})"
         if joint.how == GUESS:
             alignment = f"no images show how this {piece} is aligned to the others"
         notes.append(f"{begin}: {alignment}")

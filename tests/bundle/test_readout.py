@@ -174,9 +174,9 @@ def _of_few(world: World, shown: Keypoints, few_frames: bool = True) -> tuple:
 
 
 @pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("up", [1.0, -1.0])
-def test_few_raw_frames_show_their_own_motion(seed: int, up: float) -> None:
-    way = DOWN * [[1.0], [up]]
+@pytest.mark.parametrize("signs", [(1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0)])
+def test_few_raw_frames_show_their_own_motion(seed: int, signs: tuple[float, float]) -> None:
+    way = DOWN * np.array(signs)[:, None]
     swept = replace(RAW, row_directions=way, readout_motion=FEW_MOTION)
     world, shown = seen_through(swept, seed, FEW_POSES, FEW)
     _, _, untold = _of_few(world, shown, few_frames=False)
@@ -186,9 +186,37 @@ def test_few_raw_frames_show_their_own_motion(seed: int, up: float) -> None:
     np.testing.assert_allclose(found.lenses.row_directions, way, atol=1e-9)
     solved, found = solved_with(world, shown, found, solved, problem)
     assert readout.without_vanished(found) is found and found.lenses.readout_motion is not None
+    assert found.readout_s == pytest.approx(READOUT_S, rel=0.2)
     left = np.sqrt(np.mean((found.lenses.readout_motion - FEW_MOTION)[:, :3] ** 2))
     assert left < 0.4 * np.sqrt(np.mean(FEW_MOTION[:, :3] ** 2))
     assert solved.noise < 1.1
+
+
+@pytest.mark.parametrize("num", [FEW, 24])
+@pytest.mark.parametrize("signs", [(1.0, 1.0), (-1.0, -1.0)])
+def test_raw_lenses_are_read_as_settings_say(signs: tuple[float, float], num: int) -> None:
+    """They named the way that a lens is read from the bottom up, and were said to be contradicted;
+    where they named another, nothing was."""
+    way, few = DOWN * np.array(signs)[:, None], num == FEW
+    moved = FEW_MOTION if few else TWISTS
+    swept = replace(RAW, row_directions=way, readout_motion=moved)
+    world, shown = seen_through(swept, 0, loop_walk(24)[:num], num)
+    start = Solution.without_points(world.world_T_rigs)
+    solved, keypoints, tracks = solved_under(world, shown, RAW, start)
+    around, problem = placed(solved, keypoints, tracks), problem_of(world)
+    for said in ("+y", "-y"):
+        camera = CameraSettings(sweep=(said, said))
+        settings = problem.settings.model_copy(update={"camera": camera})
+        context = replace(problem, settings=settings, cameras=())
+        given = keypoints, context, RAW, shown.bearings_rig, times(num)
+        rays = ObservedRays(replace(solved, landmarks=around), *given)
+        found = readout.estimate(rays, few)
+        if (said == "+y") == (signs[0] > 0):
+            assert not found.reason and found.lenses.row_directions is not None
+            np.testing.assert_allclose(found.lenses.row_directions, way, atol=1e-9)
+        else:
+            assert found.reason == "rows are read the other way than camera.sweep says"
+            assert found.lenses is RAW
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -43,6 +43,19 @@ def test_another_world_and_scale_is_no_motion() -> None:
     assert step_motion(before, after, *_known(NUM)) < 1e-6
 
 
+def test_another_world_and_scale_of_one_of_two_maps_is_no_motion() -> None:
+    """Nothing ties two maps: the second one alone is moved, and grows."""
+    before, maps = loop_walk(NUM), np.repeat([0, 1], NUM // 2)
+    after = before.copy()
+    second = pose(Rotation.from_rotvec([0.0, 0.1, 0]).as_matrix(), np.array([1.0, 2, 3]))
+    after[maps == 1] = second @ before[maps == 1]
+    after[maps == 1, :3, 3] *= 1.5
+    assert step_motion(before, after, *_known(NUM)) > 1
+    assert step_motion(before, after, *_known(NUM), maps) < 1e-6
+    one = np.concatenate([np.zeros(NUM - 1, int), [7]])  # a frame alone has no step
+    assert step_motion(before, before, *_known(NUM), one) < 1e-6
+
+
 def test_steps_that_nothing_is_known_of_do_not_count() -> None:
     before, (covariances, joint) = loop_walk(NUM), _known(NUM)
     after = before.copy()

@@ -1,6 +1,7 @@
 """Similarities between two maps: proposals, and the covariance against many drawn ones."""
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from gsba.geometry import inverse, pose
@@ -42,6 +43,23 @@ def test_covariances_of_similarities_are_as_large_as_their_errors() -> None:
     # 60 draws scatter by a tenth; a covariance of 12 meetings by more, its correction for so few
     # is rough
     assert (ratios > 0.6).all() and (ratios < 1.4).all(), ratios
+
+
+@pytest.mark.parametrize("with_points", [1, 2])
+def test_the_covariance_by_one_or_two_meetings_is_not_known(with_points: int) -> None:
+    """A similarity fits the common error of a meeting: its residuals claimed no error at all."""
+    rng = np.random.default_rng(0)
+    poses = np.tile(np.eye(4), (24, 1, 1))
+    poses[:, :3, 3] = rng.uniform(-3, 3, (24, 3))
+    meetings = []
+    for n in range(12):  # of the others, the map has no point where the part has it
+        world = poses[n, :3, 3] + 3 * rng.normal(size=(30, 3))
+        seen = world + 0.002 * rng.normal(size=world.shape)
+        seen += 0.0 if n < with_points else 50.0
+        meetings.append(Meeting(12 + n, n, world - poses[12 + n, :3, 3], seen - poses[n, :3, 3]))
+    found = refined(meetings[:with_points], Sim3(), poses)
+    assert np.isnan(similarity_covariance(meetings[:with_points], found, poses)).all()
+    assert np.isnan(similarity_covariance(meetings, found, poses)).all()
 
 
 def test_nudging_by_nothing_changes_nothing() -> None:

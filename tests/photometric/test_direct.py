@@ -13,7 +13,7 @@ from tiny_run import BARE, Case, computed_stages
 from factors.patch_windows import PatchTable, patch_spans, pixel_grid
 from gsba.bundle import adjustment
 from gsba.bundle.adjustment import AdjustmentContext
-from gsba.bundle.families import Bearings, Families
+from gsba.bundle.families import Bearings, Families, Family, MapSnapshot
 from gsba.bundle.trajectory_prior import TrajectoryPrior
 from gsba.camera.lens import Lenses
 from gsba.camera.sphere import erp_from_bearings
@@ -198,6 +198,42 @@ def test_a_solve_against_the_map_is_undone(case: Case, monkeypatch: pytest.Monke
     solved, result = _refined(case)
     assert not result.adjustment.rounds[-1].accepted
     assert np.array_equal(result.adjustment.world_T_rigs, solved.world_T_rigs)
+
+
+class Offset(Family):
+    """A variable that is measured as one, and starts at zero."""
+
+    name, digest = "offset", "1"
+
+    def variables(self, snapshot: MapSnapshot) -> gtsam.Values:
+        values = gtsam.Values()
+        values.insert(gtsam.symbol("B", 0), np.zeros(1))
+        return values
+
+    def graph(self, snapshot: MapSnapshot) -> gtsam.NonlinearFactorGraph:
+        graph, unit_noise = gtsam.NonlinearFactorGraph(), gtsam.noiseModel.Unit.Create(1)
+        graph.add(gtsam.PriorFactorVector(gtsam.symbol("B", 0), np.ones(1), unit_noise))
+        return graph
+
+
+@pytest.mark.parametrize("supported", [True, False])
+def test_variables_of_families_are_undone_with_the_poses(
+    case: Case, monkeypatch: pytest.MonkeyPatch, supported: bool
+) -> None:
+    """A solve that is cheaper, but leaves frames with too few points, left its variables."""
+    monkeypatch.setattr(direct, "_MAX_GROWTH", 1e3)
+    monkeypatch.setattr(direct, "_DEPTH_LEVELS", 0)
+    monkeypatch.setattr(patches, "_SPACING_DEG", 20)
+    monkeypatch.setattr(Solution, "carries", lambda *_: supported)
+    frames, keypoints, solved, priors, rig = _start(case, JOINT)
+    families = Families((Bearings(), priors, Offset()), frames.names, frames.timestamps)
+    context = AdjustmentContext(families, rig, JOINT, 1)
+    found = direct.refine(frames, keypoints, solved, context).adjustment
+    assert found.rounds[-1].accepted == supported
+    if supported:
+        assert found.variables is not None and np.allclose(found.variables.data, 1.0, atol=0.01)
+    else:
+        assert found.variables is solved.variables
 
 
 @pytest.mark.parametrize(
