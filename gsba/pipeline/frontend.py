@@ -188,12 +188,11 @@ def _match_neighbours(state: State, name: str) -> State:
 
 def check_steps(state: State) -> Recovered:
     """Neighbours with and without the trajectory's guidance, and its steps by these; GsbaError if
-    images contradict most of it. UnusableFramesError: see `unusable_frames`."""
+    images contradict most of it."""
     run, prior, times = state.run, state.prior, state.run.frames.timestamps
     context = state.observed.context
     compute = partial(recovery.recover, context, state.verified, prior.coarse, times)
-    found = run.stage("steps", [run.matching_key(), run.settings.priors], compute, Recovered)
-    return unusable_frames.refuse_odd(state, found)
+    return run.stage("steps", [run.matching_key(), run.settings.priors], compute, Recovered)
 
 
 def judge_trajectory(state: State, found: Recovered) -> State:

@@ -488,7 +488,10 @@ def _map_all(state: State) -> State:
         state = frontend.match_neighbours(state)
         found = frontend.check_steps(state)
         state = tour.check_order(state, found)
-        state = tour.match_places(state, found) or frontend.judge_trajectory(state, found)
+        if (placed := tour.match_places(state, found)) is None:
+            unusable_frames.refuse_odd(state, found)
+            placed = frontend.judge_trajectory(state, found)
+        state = placed
         state = frontend.align_gyro_to_neighbours(state)
     if state.prior.turning_only:
         return state

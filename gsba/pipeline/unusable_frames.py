@@ -49,13 +49,13 @@ def refuse_blank(state: State) -> State:
     return state
 
 
-def refuse_odd(state: State, found: Recovered) -> Recovered:
-    """The steps of a run. UnusableFramesError: frames match neither of their neighbours, though
-    these match one another; not asked of one of several recordings."""
-    seen = np.r_[True, ~found.trust.unseen_steps, True]  # (F + 1,) the steps before each frame
-    alone = 1 + np.flatnonzero(seen[:-3] & ~seen[1:-2] & ~seen[2:-1] & seen[3:])
-    if found.trust.turning_only or not state.prior.absent or state.run.suffix or not len(alone):
-        return found
+def refuse_odd(state: State, found: Recovered) -> None:
+    """UnusableFramesError: without a trajectory, frames match neither of their neighbours, though
+    these match one another."""
+    seen = np.r_[False, ~found.trust.unseen_steps, False]  # (F + 1,) the step before each frame
+    alone = 1 + np.flatnonzero(~seen[1:-2] & ~seen[2:-1] & (seen[:-3] | seen[3:]))
+    if found.trust.turning_only or not state.prior.absent or not len(alone):
+        return
 
     def compute() -> np.ndarray:
         over = np.column_stack([alone - 1, alone + 1]).astype(np.int32)
@@ -63,7 +63,6 @@ def refuse_odd(state: State, found: Recovered) -> Recovered:
         return matched.matches.pairs[:, 0] + 1
 
     _refuse(state, _ODD, "match neither of their neighbours, which match one another", compute)
-    return found
 
 
 def _refuse(state: State, stage: str, what: str, compute: Callable[[], np.ndarray]) -> None:
