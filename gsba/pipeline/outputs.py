@@ -206,7 +206,7 @@ def _warn_of_datasets_before(out: Path, result: Reconstruction, frames: FrameSet
 
 def _findings(state: State, result: Reconstruction, gps: dict[str, Any] | None) -> Findings:
     """Sections of the report on trajectory, camera and sensors, and notes on all that is odd."""
-    prior, map_, frames = state.prior, state.map, state.run.frames
+    prior, map_, frames, given = state.prior, state.map, state.run.frames, state.run.evidence
     trajectory, notes = findings.of_trajectory(
         prior.trust, prior.clock, prior.merged, prior.joints, frames, prior.unguided
     )
@@ -241,7 +241,7 @@ def _findings(state: State, result: Reconstruction, gps: dict[str, Any] | None) 
         found,
         recordings=recordings,
         reasons=_reasons(prior),
-        frame_lists={**lists, "unusable": list(state.run.evidence.unusable)},
+        frame_lists={**lists, "unusable": sorted((*given.blank, *given.odd))},
         start=start,
         order_doubted=prior.order_doubted,
         lone_steps=prior.lone_steps,

@@ -237,24 +237,26 @@ class Start:
             families = (*made, *families[len(made) :])
         return replace(self, frames=frames, evidence=replace(self.evidence, families=families))
 
-    def without(self, names: tuple[str, ...], settings: RefineSettings) -> "Start":
+    def without(
+        self, blank: tuple[str, ...], odd: tuple[str, ...], settings: RefineSettings
+    ) -> "Start":
         """The start without unusable frames, which it lists."""
-        if not names:
+        if not blank and not odd:
             return self
-        kept = np.array([name not in names for name in self.frames.names])
+        kept = np.array([name not in (*blank, *odd) for name in self.frames.names])
         rows, recordings = np.flatnonzero(kept), list[RecordingEvidence]()
         for one in self.evidence.recordings:
             own = np.flatnonzero(kept[self.frames.recordings[one.name]])
             recordings.append(replace(one, coarse=one.coarse.taken(own)))
         left = self.on(self.frames.taken(rows), settings)
-        evidence = replace(left.evidence, recordings=tuple(recordings), unusable=names)
+        evidence = replace(left.evidence, recordings=tuple(recordings), blank=blank, odd=odd)
         return replace(left, coarse=self.coarse.taken(rows), evidence=evidence)
 
     def ready(self, store: RunStore, settings: RefineSettings) -> "Start":
         """The start as earlier attempts have found: without unusable frames, and stills in their
         order."""
         known = unusable_frames.known(store, self.frames, self.coarse, self.evidence, settings)
-        left = self.without(known, settings)
+        left = self.without(*known, settings)
         return left.on(tour.in_known_order(store, left.frames, settings), settings)
 
 

@@ -70,7 +70,8 @@ class Evidence:
     recordings: tuple[RecordingEvidence, ...] = ()  # of several recordings, in order of their
     # frames, which then have their trajectories and gyros from here; () = there is one recording
     start: RunStart = RunStart.TRAJECTORY  # for the report
-    unusable: tuple[str, ...] = ()  # names of frames that are left out, for the report
+    blank: tuple[str, ...] = ()  # names of frames that are left out: see `unusable_frames`
+    odd: tuple[str, ...] = ()
 
     def digests(self) -> list[object]:
         """Digests of the gyro's measurements and of the families of residuals."""

@@ -44,17 +44,20 @@ def refuse_blank(state: State) -> State:
     run, frames = state.run, state.run.frames
     few = np.diff(state.observed.keypoints.starts) < _MIN_KEYPOINTS
     few &= _without_trajectory(frames, run.coarse, run.evidence)
-    if few.any() and np.count_nonzero(~few) >= _MIN_FRAMES:
+    for rows in frames.recordings.values() or (slice(None),):
+        few[rows] &= np.count_nonzero(~few[rows]) >= _MIN_FRAMES
+    if few.any():
         _refuse(state, _BLANK, "show next to nothing", lambda: np.flatnonzero(few))
     return state
 
 
 def refuse_odd(state: State, found: Recovered) -> None:
     """UnusableFramesError: without a trajectory, frames match neither of their neighbours, though
-    these match one another."""
+    these match one another; asked once."""
+    run = state.run
     seen = np.r_[False, ~found.trust.unseen_steps, False]  # (F + 1,) the step before each frame
     alone = 1 + np.flatnonzero(~seen[1:-2] & ~seen[2:-1] & (seen[:-3] | seen[3:]))
-    if found.trust.turning_only or not state.prior.absent or not len(alone):
+    if found.trust.turning_only or not state.prior.absent or run.evidence.odd or not len(alone):
         return
 
     def compute() -> np.ndarray:
@@ -76,7 +79,7 @@ def _refuse(state: State, stage: str, what: str, compute: Callable[[], np.ndarra
     if names := store.stage(stage, key, find, UnusableFrames).names:
         few = named(names, "frame_lists.unusable", f"of {len(frames)} frames")
         logger.warning("frames that %s are left out: %s", what, few)
-        raise UnusableFramesError(f"some frames {what}")
+        raise UnusableFramesError(f"leave out frames that {what}: {few}")
 
 
 def known(
@@ -85,16 +88,18 @@ def known(
     coarse: CoarsePoses,
     evidence: Evidence,
     settings: RefineSettings,
-) -> tuple[str, ...]:
-    """Names of the frames that earlier attempts on all these have found unusable."""
-    names = tuple[str, ...]()
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Names of the frames that earlier attempts on all these have found blank, and odd."""
     if not _without_trajectory(frames, coarse, evidence).any():
-        return names
-    for stage in _BLANK, _ODD:
-        left = np.flatnonzero([name not in names for name in frames.names])
-        found = store.stored(stage, _key(frames.taken(left), settings), UnusableFrames)
-        names += () if found is None else found.names
-    return names
+        return (), ()
+
+    def names(stage: str, some: FrameSet) -> tuple[str, ...]:
+        found = store.stored(stage, _key(some, settings), UnusableFrames)
+        return () if found is None else found.names
+
+    blank = names(_BLANK, frames)
+    left = np.flatnonzero([name not in blank for name in frames.names])
+    return blank, names(_ODD, frames.taken(left))
 
 
 def _without_trajectory(frames: FrameSet, coarse: CoarsePoses, evidence: Evidence) -> np.ndarray:
