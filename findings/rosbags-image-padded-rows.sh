@@ -3,7 +3,8 @@
 # sensor_msgs/Image defines as "Full row length in bytes", and takes every row to be width * bytes per pixel long.
 # Cameras and decoders that align their rows to 32 or 64 bytes, and views cut from wider pictures, send such messages.
 # Expected: the picture, as numpy reads it with `step` for its row stride. Seen: another picture without a
-# warning. Each row is shifted by the padding of all rows before it, the last rows are lost, 97 to 98 % of the values are wrong.
+# warning. Each row is shifted by the padding of all rows before it, the last rows are lost, and 97 to 98 % of the
+# values are wrong.
 set -euo pipefail
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
