@@ -5,7 +5,7 @@ out, and the frames beside it are neighbours. A trajectory gives it a pose, so t
 """
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -25,6 +25,7 @@ logger = logging.getLogger(__name__)
 _BLANK, _ODD = "blank_frames", "odd_frames"  # stages
 _MIN_KEYPOINTS = 12  # of a frame: with fewer no pair of frames is verified
 _MIN_FRAMES = 3  # that are left
+_MOST_IN_A_ROW = 3  # frames without matches: further apart, others hardly match
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,23 +53,35 @@ def refuse_blank(state: State) -> State:
 
 
 def refuse_odd(state: State, found: Recovered) -> None:
-    """UnusableFramesError: without a trajectory, frames match neither of their neighbours, though
-    these match one another; asked once."""
-    run = state.run
-    seen = np.r_[False, ~found.trust.unseen_steps, False]  # (F + 1,) the step before each frame
-    alone = 1 + np.flatnonzero(~seen[1:-2] & ~seen[2:-1] & (seen[:-3] | seen[3:]))
-    if found.trust.turning_only or not state.prior.absent or run.evidence.odd or not len(alone):
+    """UnusableFramesError: without a trajectory, up to three frames in a row match neither of the
+    frames beside them, though these match one another; asked once."""
+    unseen = found.trust.unseen_steps
+    beside = [  # of the shortest rows first
+        (before, after)
+        for length in range(1, _MOST_IN_A_ROW + 1)
+        for before in range(len(unseen) - length)
+        if unseen[before : (after := before + length + 1)].all()
+        and not (unseen[before - 1 : before].all() and unseen[after : after + 1].all())
+    ]
+    asked = not found.trust.turning_only and state.prior.absent and not state.run.evidence.odd
+    if not asked or not beside:
         return
 
-    def compute() -> np.ndarray:
-        over = np.column_stack([alone - 1, alone + 1]).astype(np.int32)
-        matched = recovery.match_anywhere(state.observed.context, over)
-        return matched.matches.pairs[:, 0] + 1
+    def compute() -> list[int]:
+        over = np.array(beside, np.int32)
+        matched = recovery.match_anywhere(state.observed.context, over).frames()
+        odd = set[int]()
+        for before, after in beside:
+            if (before, after) in matched and odd.isdisjoint(range(before, after + 1)):
+                odd |= {*range(before + 1, after)}
+        return sorted(odd)
 
-    _refuse(state, _ODD, "match neither of their neighbours, which match one another", compute)
+    _refuse(
+        state, _ODD, "match neither of the frames beside them, which match one another", compute
+    )
 
 
-def _refuse(state: State, stage: str, what: str, compute: Callable[[], np.ndarray]) -> None:
+def _refuse(state: State, stage: str, what: str, compute: Callable[[], Iterable[int]]) -> None:
     """UnusableFramesError: a stage finds such frames, which the next attempt knows of."""
     store, frames = state.run.store, state.run.frames
 

@@ -1,6 +1,7 @@
 """A walk with frames that cannot be matched, as a covered lens or a damaged video leaves them."""
 
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -15,18 +16,21 @@ from gsba.trajectory.files import read_trajectory
 UNUSABLE = "000003", "000005"
 
 
-def _walk(case: Case, to: Path) -> Path:
-    """The tiny walk with a black frame, and one of something else."""
+def _walk(case: Case, to: Path, black: Sequence[str], others: Sequence[str]) -> Path:
+    """The tiny walk with black frames, and frames of something else."""
     shutil.copytree(case.frames, to)
-    other = np.random.default_rng(0).normal(128, 300, (WIDTH // 2, WIDTH, 3))
-    other = np.clip(cv2.GaussianBlur(other, (0, 0), 2.5), 0, 255)
-    for name, picture in zip(UNUSABLE, (np.zeros_like(other), other), strict=True):
+    size = WIDTH // 2, WIDTH, 3
+    for name in black:
+        cv2.imwrite(str(to / f"{name}.jpg"), np.zeros(size, np.uint8))
+    for name in others:
+        noise = np.random.default_rng(int(name)).normal(128, 300, size)
+        picture = np.clip(cv2.GaussianBlur(noise, (0, 0), 2.5), 0, 255)
         cv2.imwrite(str(to / f"{name}.jpg"), picture.astype(np.uint8))
     return to
 
 
 def test_the_frames_beside_an_unusable_one_are_neighbours(case: Case, tmp_path: Path) -> None:
-    frames, run = _walk(case, tmp_path / "walk"), tmp_path / "run"
+    frames, run = _walk(case, tmp_path / "walk", UNUSABLE[:1], UNUSABLE[1:]), tmp_path / "run"
     result = refine(frames, None, run, PLAIN)
     assert not {*UNUSABLE} & {*result.frames.names} and len(result.frames) == NUM_FRAMES - len(
         UNUSABLE
@@ -42,7 +46,18 @@ def test_the_frames_beside_an_unusable_one_are_neighbours(case: Case, tmp_path: 
 
 
 def test_a_trajectory_gives_an_unusable_frame_a_pose(case: Case, tmp_path: Path) -> None:
-    result = refine(_walk(case, tmp_path / "walk"), case.slam, tmp_path / "run", PLAIN)
+    result = refine(
+        _walk(case, tmp_path / "walk", UNUSABLE[:1], UNUSABLE[1:]),
+        case.slam,
+        tmp_path / "run",
+        PLAIN,
+    )
     assert len(result.frames) == NUM_FRAMES and not result.report["frame_lists"]["unusable"]
     named = {name for reason in result.report["verdict"]["reasons"] for name in reason["frames"]}
     assert named >= {*UNUSABLE}
+
+
+def test_two_in_a_row_are_left_out_together(case: Case, tmp_path: Path) -> None:
+    names = ["000003", "000004"]
+    frames = _walk(case, tmp_path / "walk", (), names)
+    assert refine(frames, None, tmp_path / "run", PLAIN).report["frame_lists"]["unusable"] == names
