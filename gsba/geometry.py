@@ -143,10 +143,11 @@ def typical_length(lengths: np.ndarray) -> float:
     return float(np.median(walked)) if len(walked) else 1.0
 
 
-def standing_places(centres: np.ndarray) -> np.ndarray:
+def standing_places(centres: np.ndarray, walked: np.ndarray | slice = slice(None)) -> np.ndarray:
     """Place (F,) int64, from 0, of each frame's centre (F, 3): consecutive frames in which the
-    camera stands (`standing_length`) are at one place, as views from there differ by noise."""
-    least = standing_length(np.linalg.norm(np.diff(centres, axis=0), axis=1))
+    camera stands (`standing_length`) are at one place, as views from there differ by noise. Steps
+    `walked (F - 1,)` bool tell how far it moves where it does not."""
+    least = standing_length(np.linalg.norm(np.diff(centres, axis=0), axis=1)[walked])
     places, first = np.zeros(len(centres), np.int64), 0
     for f in range(1, len(centres)):
         moved = np.linalg.norm(centres[f] - centres[first]) > least

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from factors.bearing import tangent_basis
+from gsba.bundle.families import numbered
 from gsba.bundle.shared_parameters import (
     PARTS,
     ObservedRays,
@@ -45,7 +46,7 @@ def guess(rays: ObservedRays) -> LensAxes:
     """Lenses with axes that explain most with two centres: the rig's, turned ones, or the walk's;
     keypoints are seen from one centre, whose `band_rad` is kept."""
     keypoints, so_far, frames = rays.keypoints, rays.lenses, rays.keypoints.frames()
-    tried = [replace(so_far, axes=axes) for axes in _candidates(rays.solved.world_T_rigs)]
+    tried = [replace(so_far, axes=axes) for axes in _candidates(rays)]
 
     def by_centres(rows: np.ndarray, by_start: np.ndarray, _: np.ndarray) -> np.ndarray:
         columns = []
@@ -123,20 +124,24 @@ def upright(directions: np.ndarray) -> np.ndarray:
     return np.stack([np.cross(y, z), y, z], axis=2)
 
 
-def _candidates(world_T_rigs: np.ndarray) -> list[np.ndarray]:
+def _candidates(rays: ObservedRays) -> list[np.ndarray]:
     """Candidate axes (F, 3, 3), those of the rig first."""
+    world_T_rigs = rays.solved.world_T_rigs
     fixed = np.tile([0.0, 0, 1], (len(world_T_rigs), 1))
+    headings = _headings(world_T_rigs, numbered(rays.context.maps, len(world_T_rigs)))
     return [
         upright(directions @ Rotation.from_rotvec([0, yaw, 0]).as_matrix().T)
-        for directions in (fixed, _headings(world_T_rigs))
+        for directions in (fixed, headings)
         for yaw in np.deg2rad([0.0, 45, 90, 135])
     ]
 
 
-def _headings(world_T_rigs: np.ndarray) -> np.ndarray:
-    """Level directions (F, 3) in which each rig goes, in its frame; of the nearest that does."""
-    num = len(world_T_rigs)
+def _headings(world_T_rigs: np.ndarray, maps: np.ndarray) -> np.ndarray:
+    """Level directions (F, 3) in which each rig goes in its map (F,), in its frame; of the nearest
+    that does."""
+    num, last = len(world_T_rigs), np.flatnonzero(np.diff(maps))
     before, after = np.maximum(np.arange(num) - 1, 0), np.minimum(np.arange(num) + 1, num - 1)
+    before[last + 1], after[last] = last + 1, last
     moved = world_T_rigs[after, :3, 3] - world_T_rigs[before, :3, 3]
     lengths = np.linalg.norm(moved, axis=1)
     going = np.flatnonzero(lengths > standing_length(lengths))

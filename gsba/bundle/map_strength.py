@@ -93,8 +93,9 @@ def measure(
     reach = np.ones(2 * _WEAK_REACH + 1)
     weak = np.convolve(poor, reach)[_WEAK_REACH : _WEAK_REACH + num] > 0
     lengths = np.linalg.norm(np.diff(world_T_rigs[:, :3, 3], axis=0), axis=1)
+    typical = typical_length(lengths[maps[1:] == maps[:-1]])
     allowed = np.full((len(lengths), 6), np.deg2rad(priors.rotation_deg))
-    allowed[:, 3:] = priors.translation * np.maximum(lengths, typical_length(lengths))[:, None]
+    allowed[:, 3:] = priors.translation * np.maximum(lengths, typical)[:, None]
     found = step_covariances(world_T_rigs, covariances, joint.neighbours)
     found = found / allowed[:, :, None] / allowed[:, None, :]
     known = np.isfinite(found).all(axis=(1, 2))

@@ -72,6 +72,19 @@ def _edges(matches: Sequence[Matches], first_node: np.ndarray) -> Iterator[np.nd
             release_mapped_files()
 
 
+def tied_steps(tracks: Tracks, num_frames: int) -> np.ndarray:
+    """True (num_frames - 1,) for steps whose two frames observe a point in common; none of those
+    from one map to another, laid beside it, does."""
+    tied = np.zeros(num_frames - 1, bool)
+    for some in slices(len(tracks) - 1, _AT_ONCE):
+        frames, after = tracks.frames[some], slice(some.start + 1, some.stop + 1)
+        same = tracks.points[some] == tracks.points[after]
+        tied[frames[same & (frames + 1 == tracks.frames[after])]] = True
+        if tied.all():
+            break
+    return tied
+
+
 def runs(tracks: Tracks, most: int) -> Iterator[tuple[slice, slice, Tracks]]:
     """Tracks in runs of at most `most` observations, or of a single longer one: the points of a
     run, its observations, and its tracks, whose points are numbered from 0."""

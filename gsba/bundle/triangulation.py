@@ -7,7 +7,7 @@ import numpy as np
 
 from factors.compiled import kernel_and_part
 from factors.threads import balanced_ranges, run_in_threads
-from gsba.bundle.tracks import MAX_IN_MEMORY, map_runs
+from gsba.bundle.tracks import MAX_IN_MEMORY, map_runs, tied_steps
 from gsba.disk import concatenated
 from gsba.geometry import moved_to, standing_length
 from gsba.memory import release_mapped_files
@@ -182,6 +182,7 @@ def triangulate(
     num_threads: int = 1,
     origins_rig: np.ndarray | None = None,
     min_parallax_deg: float = 0.5,
+    standing: float | None = None,
 ) -> Landmarks:
     """Triangulate every track and drop what does not fit.
 
@@ -195,8 +196,9 @@ def triangulate(
         max_error_sigmas: gate on the angle between observation and point, in sigmas.
         origins_rig: (O, 3) rig frame, where each ray starts; None = the rig's centre.
         min_parallax_deg: largest angle between two rays of a point, at least: the depth of a point
-            with less is noise. So is that of points nearer than the camera moves where it stands
-            (`standing_length`), whatever their parallax.
+            with less is noise.
+        standing: map units, how far the camera moves at most where it stands: the depth of a point
+            nearer than that is noise, whatever its parallax; None = `standing_within` the tracks.
     """
     starts = np.searchsorted(tracks.points, np.arange(tracks.num_points + 1))
     rays, centres = np.empty((len(tracks), 3)), np.empty((len(tracks), 3))
@@ -219,8 +221,8 @@ def triangulate(
     lengths = np.bincount(tracks.points[inliers > 0], minlength=tracks.num_points)
     short = lengths < _MIN_TRACK_LENGTH
     flat = ~short & (parallaxes < np.deg2rad(min_parallax_deg))
-    steps = np.linalg.norm(np.diff(world_T_rigs[:, :3, 3], axis=0), axis=1)
-    least = np.full(len(rays), standing_length(steps))
+    standing = standing_within(tracks, world_T_rigs) if standing is None else standing
+    least = np.full(len(rays), standing)
     if origins_rig is not None:
         least = np.maximum(least, np.linalg.norm(origins_rig, axis=1))
     near = (inliers > 0) & (np.linalg.norm(points[tracks.points] - centres, axis=1) < least)
@@ -234,6 +236,12 @@ def triangulate(
     return Landmarks(points[kept], survivors, counts)
 
 
+def standing_within(tracks: Tracks, world_T_rigs: np.ndarray) -> float:
+    """`standing_length` of poses (F, 4, 4), by the steps over which tracks lead."""
+    steps = np.linalg.norm(np.diff(world_T_rigs[:, :3, 3], axis=0), axis=1)
+    return standing_length(steps[tied_steps(tracks, len(world_T_rigs))])
+
+
 def place(
     tracks: Tracks,
     keypoints: Keypoints,
@@ -244,13 +252,13 @@ def place(
 ) -> Landmarks:
     """As `triangulate`, the observations being the tracks' own keypoints; some tracks at a time. A
     folder on the disk takes the points of very many tracks; None = they are in memory."""
-    counts = list[Counts]()
+    counts, standing = list[Counts](), standing_within(tracks, world_T_rigs)
 
     def placed(_: slice, __: slice, some: Tracks) -> Landmarks:
         rows = keypoints.rows(some)
         rays = keypoints.bearings_rig.take(rows, axis=0), keypoints.sigmas_rad[rows]
         how = max_error_sigmas, 1, keypoints.origins_of(rows)
-        return triangulate(some, *rays, world_T_rigs, *how)
+        return triangulate(some, *rays, world_T_rigs, *how, standing=standing)
 
     def found() -> Iterator[tuple[np.ndarray, ...]]:
         none = tracks.of(np.zeros(tracks.num_points, bool))

@@ -10,9 +10,11 @@ from factors import tangent_basis
 from factors.patches import ALIGNED, REASONS, PatchSet, Sightings, expect, found_at
 from factors.sphere_field import SphereField
 from factors.threads import map_in_threads, rows_in_threads
+from gsba.bundle.tracks import tied_steps
 from gsba.camera.cameras import ONE_CAMERA, Cameras
 from gsba.camera.rig import CubeRig
 from gsba.frames import panorama
+from gsba.geometry import standing_places
 from gsba.memory import release_mapped_files, total_memory_bytes
 from gsba.photometric import frame_jobs
 from gsba.photometric.frame_jobs import MAX_SHIFT_PX
@@ -87,6 +89,8 @@ def align(
     """
     landmarks, world_T_rigs = solved.landmarks, solved.world_T_rigs
     rows = references(landmarks, world_T_rigs)
+    walked = tied_steps(landmarks.tracks, greys.num_frames)
+    places = standing_places(world_T_rigs[:, :3, 3], walked)
     normals_world = np.zeros((len(rows), 3))
     dropped, num_found = dict.fromkeys(REJECTIONS, 0), 0
 
@@ -96,7 +100,7 @@ def align(
             chosen = np.zeros(len(rows), bool)
             chosen[points] = True
             some = replace(solved, landmarks=landmarks.of(chosen))
-            given = observed, greys, workers, lenses, name, dropped
+            given = places, observed, greys, workers, lenses, name, dropped
             found, at_hosts, normals_world[points] = _align_some(some, *given)
             num_found += len(found)
             yield found.of(points)
@@ -131,6 +135,7 @@ def _by_hosts(hosts: np.ndarray, positions: np.ndarray) -> Iterator[np.ndarray]:
 
 def _align_some(
     solved: Solution,
+    places: np.ndarray,
     observed: AlignedObservations,
     greys: panorama.Greys,
     workers: Workers,
@@ -139,7 +144,8 @@ def _align_some(
     dropped: dict[str, int],
 ) -> tuple[Observed, Observed, np.ndarray]:
     """Observations of a solution's points by their patches, in other frames and in their hosts, and
-    normals (J, 3) of the surfaces, world, zero = unknown; rejections are added to `dropped`."""
+    normals (J, 3) of the surfaces, world, zero = unknown; rejections are added to `dropped`.
+    `places` (F,) of the frames, see `standing_places`."""
     landmarks, world_T_rigs = solved.landmarks, solved.world_T_rigs
     keypoints, field = observed.keypoints, observed.field
     rows = references(landmarks, world_T_rigs)
@@ -153,7 +159,7 @@ def _align_some(
     extended = np.bincount(tracks.points, minlength=tracks.num_points) >= _MIN_TRACK_LENGTH
     if observed.aligned is not None:
         extended[tracks.points[observed.aligned[keypoints.rows(tracks)]]] = True
-    views = visible_frames(landmarks, world_T_rigs, rows, extended)
+    views = visible_frames(landmarks, world_T_rigs, rows, extended, places)
     map_, threads = (landmarks, planes, world_T_rigs), workers.num_threads
     points, seeing = views
     if lenses:  # outside the band where two pictures are blended

@@ -3,7 +3,6 @@
 import numpy as np
 
 from factors.compiled import kernel_and_part
-from gsba.geometry import standing_places
 from gsba.types import Landmarks
 
 _MAX_VIEWS = 16  # most places that a point is aligned at
@@ -27,18 +26,21 @@ def references(landmarks: Landmarks, world_T_rigs: np.ndarray) -> np.ndarray:
 
 
 def visible_frames(
-    landmarks: Landmarks, world_T_rigs: np.ndarray, rows: np.ndarray, extended: np.ndarray
+    landmarks: Landmarks,
+    world_T_rigs: np.ndarray,
+    rows: np.ndarray,
+    extended: np.ndarray,
+    places: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Frames (O,) int64 in which points (O,) int64, by point, are searched, without their
     references.
 
     They are the frames of a point's observations, and for points of `extended (J,)` those near its
     reference, observation rows (J,), in space, at any time, that see it from a similar direction
-    and distance: the most similar first, and one of those in which the camera stands.
+    and distance: the most similar first, and one of each place (F,), see `standing_places`.
     """
     centres = np.ascontiguousarray(world_T_rigs[:, :3, 3])
     frames, points = landmarks.tracks.frames, landmarks.points_world
-    places = standing_places(centres)
     num_near = min(_NEAR_FRAMES, places[-1])
     near = np.empty((len(centres), num_near), np.int64)
     for f in np.unique(frames[rows]):

@@ -35,6 +35,7 @@ class KeptMap:
     coarse: CoarsePoses  # of its frames, in the world of the result
     order_doubted: bool = False  # see `pipeline.tour.check_order`
     lone_steps: tuple[tuple[str, str], ...] = ()  # the same
+    unusable: tuple[str, ...] = ()  # names of frames, see `pipeline.unusable_frames`
 
 
 def keep(state: State) -> None:
@@ -49,7 +50,8 @@ def keep(state: State) -> None:
         )
         map_ = replace(map_, stitching=field)
     prior = state.prior
-    kept = KeptMap(map_, prior.coarse, prior.order_doubted, prior.lone_steps)
+    doubts = prior.order_doubted, prior.lone_steps, state.run.evidence.unusable
+    kept = KeptMap(map_, prior.coarse, *doubts)
     state.run.stage(_STAGE, [], lambda: kept, KeptMap, noted=False)
     if settings := tuple(one.model_dump_json() for one in state.run.camera_settings):
         state.run.stage(_CAMERAS, [], lambda: settings, tuple[str, ...], noted=False)
@@ -70,6 +72,7 @@ class FinishedRun:
     camera_settings: tuple[CameraSettings, ...]  # (C,)
     order_doubted: bool = False  # see `pipeline.tour.check_order`
     lone_steps: tuple[tuple[str, str], ...] = ()  # names of frames, see `pipeline.tour.check_order`
+    unusable: tuple[str, ...] = ()  # names of frames, see `pipeline.unusable_frames`
 
     @classmethod
     def load(cls, root: Path) -> "FinishedRun":
@@ -90,7 +93,8 @@ class FinishedRun:
         each = [[stage / f"{name}.npz" for stage in stages] for name in frames.names]
         files = tuple(next(filter(Path.is_file, paths), paths[-1]) for paths in each)
         origin = {what: Path(path) for what, path in read_marker(root)["origin"].items()}
-        settings, lone = load_config(root / "config.toml"), kept.lone_steps
+        settings = load_config(root / "config.toml")
+        lone, unusable = kept.lone_steps, kept.unusable
         if not frames.recordings:
             path = origin.get("frames", root)
             name = (path.stem if path.is_file() else path.name) or "frames"
@@ -101,12 +105,14 @@ class FinishedRun:
                 clock_shifts=(0.0,) * num,
             )
             lone = tuple((f"{name}/{a}", f"{name}/{b}") for a, b in lone)
+            unusable = tuple(f"{name}/{own}" for own in unusable)
         given = frames, kept.map, kept.coarse, result
         cameras = settings.camera, *([settings.camera] * (len(frames.formats) - 1))
         if len(cameras) > 1:
             known = load_stage(root, _CAMERAS, tuple[str, ...])
             cameras = tuple(CameraSettings.model_validate_json(one) for one in known)
-        return cls(root, origin, *given, settings, files, cameras, kept.order_doubted, lone)
+        doubts = kept.order_doubted, lone, unusable
+        return cls(root, origin, *given, settings, files, cameras, *doubts)
 
     def recordings(self) -> dict[str, FrameSet]:
         """Frames of each recording by its name, on its own clock, under their own names."""
@@ -151,6 +157,7 @@ class FinishedRun:
             coarse=self.coarse.taken(rows),
             result=_result_of(self.result, rows, _tied(map_, frames)),
             files=tuple(self.files[f] for f in rows),
+            unusable=tuple(u for u in self.unusable if u.rpartition("/")[0] not in names),
         )
 
 

@@ -499,7 +499,9 @@ def _write(
         order_doubted=any(run.order_doubted for run in maps.runs),
         lone_steps=tuple(step for run in maps.runs for step in run.lone_steps),
     )
-    run = replace(state.run, settings=maps.runs[0].settings)
+    unusable = tuple(name for run in maps.runs for name in run.unusable)
+    evidence = replace(state.run.evidence, blank=unusable)
+    run = replace(state.run, settings=maps.runs[0].settings, evidence=evidence)
     state = replace(state, run=run, prior=prior)
     finished_run.keep(state)
     return outputs.write(state, result, lenses)

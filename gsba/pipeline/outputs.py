@@ -241,7 +241,7 @@ def _findings(state: State, result: Reconstruction, gps: dict[str, Any] | None) 
         found,
         recordings=recordings,
         reasons=_reasons(prior),
-        frame_lists={**lists, "unusable": sorted((*given.blank, *given.odd))},
+        frame_lists={**lists, "unusable": list(given.unusable)},
         start=start,
         order_doubted=prior.order_doubted,
         lone_steps=prior.lone_steps,

@@ -73,6 +73,11 @@ class Evidence:
     blank: tuple[str, ...] = ()  # names of frames that are left out: see `unusable_frames`
     odd: tuple[str, ...] = ()
 
+    @property
+    def unusable(self) -> tuple[str, ...]:
+        """Names of all frames that are left out."""
+        return tuple(sorted((*self.blank, *self.odd)))
+
     def digests(self) -> list[object]:
         """Digests of the gyro's measurements and of the families of residuals."""
         families = [(family.name, family.digest) for family in self.families]

@@ -150,6 +150,7 @@ MAX_UNSHARP_ERROR = 0.1  # of the extent; beyond, images do not determine the ma
 MAX_CONTRADICTED_SHARE = 0.25  # of the steps, by far frames
 MAX_HELD_SHARE = 0.5  # of the steps, by the start alone
 MAX_DOUBTED_SHARE = 0.25  # of the steps, by a start that images contradict elsewhere
+MAX_LOOSE_SHARE = 0.5  # of the steps, where the scale is not carried on and no start gives it
 MAX_UNMATCHED_SHARE = 0.25  # of a run's steps, where frames are missing and no start is given
 MAX_RESIDUAL_RATIO = 3.0  # of a frame, in the median one's: right maps have up to 1.9
 MIN_OBSERVATIONS_SHARE = 0.05  # of a frame, of the median one's: right maps have .09 and more
@@ -453,8 +454,10 @@ class _Tests:
             "give frames closer together there (of a video leave --fps out), walk slowly through "
             "doors, and come back to places where you were"
         )
-        ends = self._ends(loose.tolist())
-        yield Reason(Level.LOOK, ends, cause, remedy, command=_LOOK_AROUND)
+        ends, most = self._ends(loose.tolist()), MAX_LOOSE_SHARE * self.figures.num_steps
+        free = self._start == RunStart.PAIRS and len(loose) > most
+        level = Level.REFUSED if free else Level.LOOK
+        yield Reason(level, ends, cause, remedy, command=_LOOK_AROUND)
 
     def _uncertain(self) -> Iterator[Reason]:
         """Positions that the images hold too loosely."""

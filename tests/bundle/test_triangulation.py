@@ -1,5 +1,7 @@
 """Scene points from bearings: exact, robust, and the least-squares ones."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
@@ -114,8 +116,22 @@ def test_noise_of_a_camera_that_stands_for_a_while_makes_no_points() -> None:
     names = np.repeat(np.arange(300, dtype=np.int32), 2)
     tracks = Tracks(names, np.tile(np.int32([3, 4]), 300), names.copy(), 300)
     given = noisy[:, 3:5].reshape(-1, 3), np.full(600, 20 * SIGMA)
-    found = triangulation.triangulate(tracks, *given, world_T_rigs, 8.0)
+    standing = triangulation.standing_within(_all_see_all(9, 1), world_T_rigs)
+    found = triangulation.triangulate(tracks, *given, world_T_rigs, 8.0, standing=standing)
     assert found.counts.kept == 0 and found.counts.dropped["too near"] > 50
+
+
+def test_the_way_between_maps_laid_side_by_side_is_no_step() -> None:
+    """Every third frame is in no map, and lies a hundred times as far away as the walk is long."""
+    world_T_rigs, points = loop_walk(9, 1.0), _points(40, np.random.default_rng(7))
+    mapped = np.flatnonzero(np.arange(9) % 3 < 2)
+    bearings = _observe(points, world_T_rigs[mapped])
+    world_T_rigs[2::3, 0, 3] += 100
+    seen = _all_see_all(len(mapped), 40)
+    tracks = replace(seen, frames=mapped[seen.frames].astype(np.int32))
+    sigmas = np.full(len(tracks), SIGMA)
+    found = triangulation.triangulate(tracks, bearings, sigmas, world_T_rigs, 8.0)
+    assert found.counts.kept == 40
 
 
 def test_points_behind_are_refused() -> None:

@@ -158,7 +158,7 @@ def test_patches_are_looked_for_at_the_seen_alone(case: Case) -> None:
     for landmarks in case.landmarks():
         rows = references(landmarks, poses)
         extended = np.ones(len(rows), bool)
-        views = visible_frames(landmarks, poses, rows, extended)
+        views = visible_frames(landmarks, poses, rows, extended, np.arange(len(poses)))
         found.append((rows, views))
     np.testing.assert_array_equal(found[0][0][case.seen], found[1][0])
     points, frames = found[0][1]

@@ -25,7 +25,7 @@ from gsba.disk import hold_folder
 from gsba.export import ExportFormat
 from gsba.frames.recordings import combine
 from gsba.localization import Localizer
-from gsba.pipeline.finished_run import KeptMap
+from gsba.pipeline.finished_run import FinishedRun, KeptMap
 from gsba.pipeline.growing import complete
 from gsba.similarity import Sim3
 from gsba.store.folder import STAGES
@@ -223,6 +223,7 @@ def test_rigid_merging_keeps_both_maps_and_tells_how_sure_it_is(
     doubted = Path(shutil.copytree(second_run, tmp_path / "doubted"))
     kept = load_stage(doubted, "map", KeptMap)
     kept = replace(kept, order_doubted=True, lone_steps=(("000003", "000004"),))
+    kept = replace(kept, unusable=("black",))
     save_record(doubted / STAGES / "map.npz", kept, {})
     result = merge_runs([home.run, doubted], tmp_path / "run", rigid=True)
     assert result.report["verdict"]["figures"]["position_error"] < 0.01
@@ -230,6 +231,9 @@ def test_rigid_merging_keeps_both_maps_and_tells_how_sure_it_is(
     assert any("hardly more alike than any two" in reason["cause"] for reason in reasons)
     (lone,) = (reason for reason in reasons if "own two frames alone" in reason["cause"])
     assert lone["frames"] == ["upper/000003", "upper/000004"]
+    (unusable,) = (reason for reason in reasons if "next to nothing" in reason["cause"])
+    assert unusable["frames"] == ["upper/black"] == result.report["frame_lists"]["unusable"]
+    assert not FinishedRun.load(tmp_path / "run").without(["upper"]).unusable
     first, second = load_run(home.run)[0], load_run(second_run)[0]
     merged = load_run(tmp_path / "run")[0]
     assert merged.world_T_rigs[:NUM].tobytes() == first.world_T_rigs.tobytes()

@@ -206,6 +206,18 @@ def test_each_failed_test_names_place_cause_and_remedy(
     )
 
 
+@pytest.mark.parametrize(
+    ("loose", "start", "level"),
+    [(10, "PAIRS", "REFUSED"), (9, "PAIRS", "LOOK"), (10, "ODOMETRY", "LOOK")],
+)
+def test_images_alone_make_no_map_of_which_most_steps_leave_the_scale_open(
+    loose: int, start: str, level: str
+) -> None:
+    open_at = (math.inf,) * loose
+    figures = replace(GOOD, scale_changes=open_at, moved_by_scale=open_at)
+    assert _verdict(figures, start=RunStart[start]).level == Level[level]
+
+
 @pytest.mark.parametrize(("inside", "level"), [(19, Level.LOOK), (9, Level.REFUSED)])
 def test_frames_that_are_not_exported_are_named(inside: int, level: Level) -> None:
     figures = replace(GOOD, exported=inside)
