@@ -38,7 +38,7 @@ from gsba.splat import refinement
 from gsba.splat.refinement import SplatResult
 from gsba.store.store import digest
 from gsba.trajectory import judgement, steps
-from gsba.types import PoseStatus, Reconstruction, Solution, Tracks
+from gsba.types import PoseSource, PoseStatus, Reconstruction, Solution, Tracks
 
 logger = logging.getLogger(__name__)
 
@@ -284,6 +284,12 @@ def reconstruct(
         covariances, joint = common_errors.added(
             measured.poses, measured.joint, solution.world_T_rigs, prior.parts
         )
+        between = PoseSource.INTERPOLATED, PoseSource.EXTRAPOLATED
+        guessed = np.isin(prior.coarse.sources, between)
+        guessed &= solution.observations() < MIN_OBSERVATIONS
+        if guessed.any():  # a trajectory's noise does not tell how far these are off
+            factors = np.where(guessed, np.nan, 1.0)[:, None] * np.ones(6)
+            covariances, joint = covariances * factors[:, :, None], joint.scaled(factors)
         worlds = None if run.families.fixing_gauge.members else prior.worlds()
         result = assemble(
             solution,

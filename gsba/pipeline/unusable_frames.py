@@ -1,7 +1,7 @@
 """Frames that cannot be matched, as behind a covered lens, blurred, or of a damaged video.
 
 Where images alone tell how the camera moved, such a frame would part the walk in two: it is left
-out, and the frames beside it are neighbours. A trajectory gives it a pose, so that it stays.
+out, and the frames beside it are neighbours. If a trajectory has a pose for it, it stays.
 """
 
 import logging
@@ -18,7 +18,7 @@ from gsba.pipeline.run import Evidence
 from gsba.pipeline.state import State
 from gsba.report.findings import named
 from gsba.store.store import RunStore, fingerprint
-from gsba.types import CoarsePoses, FrameSet
+from gsba.types import CoarsePoses, FrameSet, PoseSource, RunStart
 
 logger = logging.getLogger(__name__)
 
@@ -40,11 +40,11 @@ class UnusableFramesError(GsbaError):
 
 
 def refuse_blank(state: State) -> State:
-    """The first state of a run. UnusableFramesError: frames without a trajectory show next to
+    """The first state of a run. UnusableFramesError: frames that no trajectory has show next to
     nothing."""
     run, frames = state.run, state.run.frames
     few = np.diff(state.observed.keypoints.starts) < _MIN_KEYPOINTS
-    few &= _without_trajectory(frames, run.coarse, run.evidence)
+    few &= _without_pose(frames, run.coarse, run.evidence)
     for rows in frames.recordings.values() or (slice(None),):
         few[rows] &= np.count_nonzero(~few[rows]) >= _MIN_FRAMES
     if few.any():
@@ -103,7 +103,7 @@ def known(
     settings: RefineSettings,
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Names of the frames that earlier attempts on all these have found blank, and odd."""
-    if not _without_trajectory(frames, coarse, evidence).any():
+    if not _without_pose(frames, coarse, evidence).any():
         return (), ()
 
     def names(stage: str, some: FrameSet) -> tuple[str, ...]:
@@ -115,11 +115,14 @@ def known(
     return blank, names(_ODD, frames.taken(left))
 
 
-def _without_trajectory(frames: FrameSet, coarse: CoarsePoses, evidence: Evidence) -> np.ndarray:
-    """True (F,) for frames whose recording has no trajectory."""
-    alone = np.full(len(frames), coarse.absent and not evidence.recordings)
-    for one in evidence.recordings:
-        alone[frames.recordings[one.name]] = one.coarse.absent
+def _without_pose(frames: FrameSet, coarse: CoarsePoses, evidence: Evidence) -> np.ndarray:
+    """True (F,) for frames that no trajectory has; none of those that odometry has followed."""
+    alone = np.zeros(len(frames), bool)
+    of_each = [
+        (frames.recordings[one.name], one.coarse, one.start) for one in evidence.recordings
+    ] or [(np.arange(len(frames)), coarse, evidence.start)]
+    for rows, own, start in of_each:
+        alone[rows] = own.absent | ((own.sources != PoseSource.SLAM) & (start != RunStart.ODOMETRY))
     return alone
 
 

@@ -325,12 +325,16 @@ class _Tests:
 
     def _unrefined(self) -> Iterator[Reason]:
         """Frames that images do not constrain."""
-        rows = self.figures.unrefined
-        if rows:
-            cause = f"hardly any matches: the pose is that of the {self._start}"
+        given = {row["name"]: row.get("coarse_pose") for row in self.report["frames"]}
+        of_source = dict[str, list[str]]()
+        for name in (self.names[f] for f in self.figures.unrefined):
+            between = given[name] in ("interpolated", "extrapolated")
+            source = str(given[name]) if between else f"that of the {self._start}"
+            of_source.setdefault(source, []).append(name)
+        for source, names in of_source.items():
+            cause = f"hardly any matches: the pose is {source}"
             remedy = "leave these frames out of the training, or give sharper ones"
-            frames = tuple(self.names[f] for f in rows)
-            yield Reason(Level.LOOK, frames, cause, remedy, True, _WITHOUT_DOUBTED)
+            yield Reason(Level.LOOK, tuple(names), cause, remedy, True, _WITHOUT_DOUBTED)
 
     def _misfitting(self) -> Iterator[Reason]:
         """Frames whose points fit much worse than those of others of their recording."""
