@@ -124,7 +124,7 @@ class _Joining:
         sizes = np.bincount(self.parts[free], minlength=1)
         if not free.any() or (component > 0 and sizes.max() < MIN_MAP_FRAMES):
             return False
-        base = self.parts == int(np.argmax(sizes))
+        base = free & (self.parts == int(np.argmax(sizes)))
         self.components[base], self.met[base], self.current = component, True, component
         return True
 
@@ -163,7 +163,7 @@ class _Joining:
         inside = np.flatnonzero(self.components == self.current)
         free = self.components < 0
         for part in np.unique(self.parts[free]).tolist():
-            rows = np.flatnonzero(self.parts == part)
+            rows = np.flatnonzero(free & (self.parts == part))
             if not self._is_new(rows, inside):
                 continue
             if len(rows) >= MIN_MAP_FRAMES and any(np.isfinite(self.known[f]).any() for f in rows):

@@ -359,6 +359,48 @@ def test_frames_alone_are_registered_against_the_map() -> None:
     assert not found.lost.any() and not found.components.any()
 
 
+def _registered_alone(
+    frames: tuple[int, ...], only: int, seen: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> Registered:
+    """A map and a part of some frames without points, in a world of its own, of which one can be
+    registered."""
+    context, whole, _ = scene()
+    whole = _without_map(whole, frames)
+    whole.world_T_rigs[list(frames)] = MOVE @ TRUTH[list(frames)]
+    register, numbers = map_merging._Joining._register, np.arange(NUM)
+
+    def registered(self, f: int, inside: np.ndarray) -> bool:
+        return f == only and register(self, f, inside)
+
+    monkeypatch.setattr(map_merging._Joining, "_register", registered)
+    parts_of = np.isin(numbers, frames).astype(int)
+    return map_merging.merge(context, whole, parts_of, NOBODY, seen, TIMES)
+
+
+def test_a_frame_goes_where_the_registered_one_that_it_is_tied_to_has_moved(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The first of two is registered once: again, it would no longer move."""
+    found = _registered_alone((13, 14), 13, np.arange(NUM - 1) == 13, monkeypatch)
+    np.testing.assert_array_equal(np.flatnonzero(found.alone), [13])
+    assert not found.lost.any() and not found.components.any()
+    off, turned = _errors(found)
+    assert off < 0.02 and turned < 0.2
+    np.testing.assert_allclose(found.moves[13], inverse(MOVE), atol=0.02)
+
+
+def test_what_is_left_of_a_part_does_not_take_its_registered_frame_along(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    found = _registered_alone((12, 13, 14, 15), 12, NOBODY, monkeypatch)
+    np.testing.assert_array_equal(np.flatnonzero(found.alone), [12])
+    np.testing.assert_array_equal(np.flatnonzero(found.components), [13, 14, 15])
+    poses = found.solved.world_T_rigs
+    np.testing.assert_allclose(poses[12], TRUTH[12], atol=0.02)
+    steps = inverse(poses[13]) @ poses[[14, 15]]
+    np.testing.assert_allclose(steps, inverse(TRUTH[13]) @ TRUTH[[14, 15]], atol=1e-9)
+
+
 def test_a_single_frame_does_not_join_two_recordings() -> None:
     """A frame is registered where its recording has frames, and nowhere else."""
     context, whole, _ = scene()
