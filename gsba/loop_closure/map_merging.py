@@ -33,6 +33,7 @@ logger = logging.getLogger(__name__)
 _NUM_CANDIDATES = 3  # candidate places for each frame of a part; twice as many for a single frame
 _NUM_MEETINGS = 24  # pairs of frames sharing the most points, to propose a similarity at each pace
 _BREAK_REACH_FRAMES = 3  # frames from a break that are compared in any case
+_MIN_UNIT_POINTS = 8  # least number of points by which a single frame's unit is known
 _MAX_PACES = 3.0  # largest distance of a single frame from its neighbours, in median paces
 # Largest angle between the verticals of two parts, besides the spread within each: of one
 # recording, and of two, whose cameras may be held in another way.
@@ -419,12 +420,16 @@ class _Joining:
         """True if a single frame gets an accepted pose from points of the map, and joins it."""
         chosen = self._candidates(np.array([f]), inside, 2 * _NUM_CANDIDATES)
         for strongest in (True, False):
-            found = self._resected(f, *self._sightings(f, chosen, strongest))
+            rows, points = self._sightings(f, chosen, strongest)
+            found = self._resected(f, rows, points)
             if found is None:
                 continue
             world_T_rig = self._resected_at_pace(f, inside, found.world_T_rig)
             if world_T_rig is not None and self._shows_map(f, inside, world_T_rig):
-                self.moves[f] = self._move_of(f, world_T_rig)
+                seen = found.inliers
+                unit = self._unit_of(f, rows[seen], points[seen] - world_T_rig[:3, 3])
+                self.known[f] = unit * self.known[f]
+                self.moves[f] = self._move_of(f, world_T_rig, unit if np.isfinite(unit) else 1.0)
                 self.poses[f] = world_T_rig
                 self.components[f] = self.current
                 self.met[f] = self.alone[f] = True
@@ -463,8 +468,17 @@ class _Joining:
                 best, most = other.world_T_rig, int(other.inliers.sum())
         return best
 
-    def _move_of(self, f: int, world_T_rig: np.ndarray) -> Sim3:
-        return Sim3.of(1.0, world_T_rig @ inverse(self.poses[f]))
+    def _unit_of(self, f: int, rows: np.ndarray, offsets: np.ndarray) -> float:
+        """Length in the map of a unit of a frame's own points, by offsets (m, 3) to the map's
+        points that its keypoints (m,) observe; NaN where few are points of its own."""
+        ratios = np.linalg.norm(offsets, axis=1) / np.linalg.norm(self.known[f][rows], axis=1)
+        ratios = ratios[np.isfinite(ratios)]
+        return float(np.median(ratios)) if len(ratios) >= _MIN_UNIT_POINTS else np.nan
+
+    def _move_of(self, f: int, world_T_rig: np.ndarray, scale: float = 1.0) -> Sim3:
+        stretched = self.poses[f].copy()
+        stretched[:3, 3] *= scale
+        return Sim3.of(scale, world_T_rig @ inverse(stretched))
 
     def _shows_map(self, f: int, inside: np.ndarray, world_T_rig: np.ndarray) -> bool:
         """True unless a frame shows next to nothing of the map around, as at a look-alike poster.

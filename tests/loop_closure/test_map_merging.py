@@ -401,6 +401,40 @@ def test_what_is_left_of_a_part_does_not_take_its_registered_frame_along(
     np.testing.assert_allclose(steps, inverse(TRUTH[13]) @ TRUTH[[14, 15]], atol=1e-9)
 
 
+@pytest.mark.parametrize("scale", [0.5, 2.0])
+def test_two_frames_with_points_in_a_unit_of_their_own_are_registered(scale: float) -> None:
+    """Points of the first one do not lead the second astray, and come to where they are."""
+    context, whole, _ = scene()
+    alone, tracks, places = (13, 14), whole.landmarks.tracks, whole.landmarks.points_world
+    own = np.isin(tracks.frames, alone)
+    first, second = (tracks.points[tracks.frames == f] for f in alone)
+    shared = np.intersect1d(first, second)
+    kept = ~own | np.isin(tracks.points, shared)
+    points = tracks.points[kept] + len(places) * own[kept]
+    order = np.lexsort((tracks.frames[kept], points))
+    used, points = np.unique(points[order], return_inverse=True)
+    seen = Tracks(
+        points.astype(np.int32),
+        tracks.frames[kept][order],
+        tracks.keypoints[kept][order],
+        len(used),
+    )
+    move = Sim3.of(scale, MOVE)
+    landmarks = replace(
+        whole.landmarks, points_world=np.vstack([places, move.points(places)])[used], tracks=seen
+    )
+    poses = TRUTH.copy()
+    poses[list(alone)] = move.poses(poses[list(alone)])
+    pair = replace(whole, world_T_rigs=poses, landmarks=landmarks)
+    parts_of = np.isin(np.arange(NUM), alone).astype(int)
+    found = map_merging.merge(context, pair, parts_of, NOBODY, NOBODY, TIMES)
+    np.testing.assert_array_equal(np.flatnonzero(found.alone), alone)
+    assert not found.lost.any() and max(_errors(found)) < 0.2
+    np.testing.assert_allclose(found.scales[list(alone)], 1 / scale, rtol=0.005)
+    off = found.solved.landmarks.points_world - places[used % len(places)]
+    assert np.median(np.linalg.norm(off[used >= len(places)], axis=1)) < 0.02
+
+
 def test_a_single_frame_does_not_join_two_recordings() -> None:
     """A frame is registered where its recording has frames, and nowhere else."""
     context, whole, _ = scene()
