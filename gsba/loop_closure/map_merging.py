@@ -556,7 +556,7 @@ class _Joining:
         poses[:, :3, 3] += offsets
         scales = np.array([move.scale for move in self.moves])
         moves = np.array([move.new_T_old for move in self.moves])
-        num, alone = int(self.parts.max()) + 1, int(lost.sum())
+        num, alone = int(self.parts.max()) + 1, len(np.unique(self.parts[lost]))
         dropped = {"frames alone": alone, "apart": maps - 1}
         kept = num - maps - alone
         return Registered(

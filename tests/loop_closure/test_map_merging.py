@@ -460,6 +460,9 @@ def test_a_frame_of_elsewhere_stays_where_its_steps_have_it_or_is_not_registered
     np.testing.assert_array_equal(np.flatnonzero(found.lost), [30])
     np.testing.assert_array_equal(found.components, parts_of)  # apart: a guess is not exported
     assert not found.alone.any() and found.counts.dropped == {"frames alone": 1, "apart": 0}
+    pair = context, given[1], np.isin(np.arange(NUM), (30, 31)).astype(int), NOBODY
+    counts = map_merging.merge(*pair, NOBODY, TIMES).counts
+    assert (counts.received, counts.kept) == (1, 0)  # a part is one, whatever its frames
     by_steps = map_merging.merge(*given, ~NOBODY, TIMES)
     assert not by_steps.lost.any() and not by_steps.components.any()
 
