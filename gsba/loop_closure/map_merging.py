@@ -301,13 +301,16 @@ class _Joining:
         self, rows: np.ndarray, inside: np.ndarray, max_intervals: float
     ) -> list[tuple[int, int]]:
         """Neighbours in time of one recording, one of a part and one of the map; frames between
-        that are in no map, as dark ones, count as missing."""
+        that are in no map, as dark ones, count as missing. Intervals are compared with those of the
+        recording, as others may have been taken at another rate."""
         mapped = np.bincount(self.parts)[self.parts] >= MIN_MAP_FRAMES
         mapped[rows] = mapped[inside] = True
-        shown = np.flatnonzero(mapped)
-        near = shown[pairs.without_pause(self.times[shown], max_intervals)]
-        near = near[self.recordings[near[:, 0]] == self.recordings[near[:, 1]]]
-        near = np.concatenate([near, near[:, ::-1]])
+        near = np.zeros((0, 2), np.int64)
+        for number in np.unique(self.recordings[rows]):
+            shown = np.flatnonzero(mapped & (self.recordings == number))
+            if len(shown) > 1:
+                own = shown[pairs.without_pause(self.times[shown], max_intervals)]
+                near = np.concatenate([near, own, own[:, ::-1]])
         near = near[np.isin(near[:, 0], rows) & np.isin(near[:, 1], inside)]
         return sorted(((int(f), int(g)) for f, g in near), key=min)
 

@@ -157,6 +157,20 @@ def test_pairs_over_a_pause_join_what_the_surroundings_confirm(
         assert _errors(found)[0] < 0.05
 
 
+def test_a_pause_is_one_among_the_intervals_of_its_recording(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Stills that lie between two videos have longer intervals than most frames."""
+    context, whole, late = scene()
+    monkeypatch.setattr(map_merging._Joining, "_meetings", lambda *_: [])
+    owners = np.digitize(np.arange(NUM), [HALF - 6, HALF + 6])
+    intervals = np.where(owners == 1, 1.0, 0.1)
+    intervals[np.diff(owners, prepend=0) > 0] = 100.0
+    given = torn(whole, late, SCALE, MOVE), _halves(), NOBODY, ~BREAK, np.cumsum(intervals)
+    found = map_merging.merge(context, *given, recordings=owners)
+    assert not found.components.any() and _errors(found)[0] < 0.05
+
+
 @pytest.mark.parametrize(
     ("what", "joined"), [("walks on", True), ("missing", False), ("carried", False)]
 )
