@@ -232,7 +232,7 @@ class Odometry:
         """Summary of the odometry in one line for the terminal."""
         told = self.report()
         line = f"{told['posed']} of {told['frames']} frames posed, {told['keyframes']} keyframes"
-        if not (self.statuses == FrameStatus.TRACKED).any():
+        if told["posed"] and not (self.statuses == FrameStatus.TRACKED).any():
             line += ", rotations only: the camera did not move enough to tell where it went"
         for count, name in ((len(self.loops), "loop"), (len(self.joins), "map")):
             if count:
