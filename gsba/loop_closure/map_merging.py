@@ -33,6 +33,7 @@ logger = logging.getLogger(__name__)
 _NUM_CANDIDATES = 3  # candidate places for each frame of a part; twice as many for a single frame
 _NUM_MEETINGS = 24  # pairs of frames sharing the most points, to propose a similarity at each pace
 _BREAK_REACH_FRAMES = 3  # frames from a break that are compared in any case
+_MIN_UNIT_POINTS = 8  # least number of points by which a single frame's unit is known
 _MAX_PACES = 3.0  # largest distance of a single frame from its neighbours, in median paces
 # Largest angle between the verticals of two parts, besides the spread within each: of one
 # recording, and of two, whose cameras may be held in another way.
@@ -124,7 +125,7 @@ class _Joining:
         sizes = np.bincount(self.parts[free], minlength=1)
         if not free.any() or (component > 0 and sizes.max() < MIN_MAP_FRAMES):
             return False
-        base = self.parts == int(np.argmax(sizes))
+        base = free & (self.parts == int(np.argmax(sizes)))
         self.components[base], self.met[base], self.current = component, True, component
         return True
 
@@ -163,7 +164,7 @@ class _Joining:
         inside = np.flatnonzero(self.components == self.current)
         free = self.components < 0
         for part in np.unique(self.parts[free]).tolist():
-            rows = np.flatnonzero(self.parts == part)
+            rows = np.flatnonzero(free & (self.parts == part))
             if not self._is_new(rows, inside):
                 continue
             if len(rows) >= MIN_MAP_FRAMES and any(np.isfinite(self.known[f]).any() for f in rows):
@@ -300,13 +301,16 @@ class _Joining:
         self, rows: np.ndarray, inside: np.ndarray, max_intervals: float
     ) -> list[tuple[int, int]]:
         """Neighbours in time of one recording, one of a part and one of the map; frames between
-        that are in no map, as dark ones, count as missing."""
+        that are in no map, as dark ones, count as missing. Intervals are compared with those of the
+        recording, as others may have been taken at another rate."""
         mapped = np.bincount(self.parts)[self.parts] >= MIN_MAP_FRAMES
         mapped[rows] = mapped[inside] = True
-        shown = np.flatnonzero(mapped)
-        near = shown[pairs.without_pause(self.times[shown], max_intervals)]
-        near = near[self.recordings[near[:, 0]] == self.recordings[near[:, 1]]]
-        near = np.concatenate([near, near[:, ::-1]])
+        near = np.zeros((0, 2), np.int64)
+        for number in np.unique(self.recordings[rows]):
+            shown = np.flatnonzero(mapped & (self.recordings == number))
+            if len(shown) > 1:
+                own = shown[pairs.without_pause(self.times[shown], max_intervals)]
+                near = np.concatenate([near, own, own[:, ::-1]])
         near = near[np.isin(near[:, 0], rows) & np.isin(near[:, 1], inside)]
         return sorted(((int(f), int(g)) for f, g in near), key=min)
 
@@ -419,12 +423,16 @@ class _Joining:
         """True if a single frame gets an accepted pose from points of the map, and joins it."""
         chosen = self._candidates(np.array([f]), inside, 2 * _NUM_CANDIDATES)
         for strongest in (True, False):
-            found = self._resected(f, *self._sightings(f, chosen, strongest))
+            rows, points = self._sightings(f, chosen, strongest)
+            found = self._resected(f, rows, points)
             if found is None:
                 continue
             world_T_rig = self._resected_at_pace(f, inside, found.world_T_rig)
             if world_T_rig is not None and self._shows_map(f, inside, world_T_rig):
-                self.moves[f] = self._move_of(f, world_T_rig)
+                seen = found.inliers
+                unit = self._unit_of(f, rows[seen], points[seen] - world_T_rig[:3, 3])
+                self.known[f] = unit * self.known[f]
+                self.moves[f] = self._move_of(f, world_T_rig, unit if np.isfinite(unit) else 1.0)
                 self.poses[f] = world_T_rig
                 self.components[f] = self.current
                 self.met[f] = self.alone[f] = True
@@ -463,8 +471,17 @@ class _Joining:
                 best, most = other.world_T_rig, int(other.inliers.sum())
         return best
 
-    def _move_of(self, f: int, world_T_rig: np.ndarray) -> Sim3:
-        return Sim3.of(1.0, world_T_rig @ inverse(self.poses[f]))
+    def _unit_of(self, f: int, rows: np.ndarray, offsets: np.ndarray) -> float:
+        """Length in the map of a unit of a frame's own points, by offsets (m, 3) to the map's
+        points that its keypoints (m,) observe; NaN where few are points of its own."""
+        ratios = np.linalg.norm(offsets, axis=1) / np.linalg.norm(self.known[f][rows], axis=1)
+        ratios = ratios[np.isfinite(ratios)]
+        return float(np.median(ratios)) if len(ratios) >= _MIN_UNIT_POINTS else np.nan
+
+    def _move_of(self, f: int, world_T_rig: np.ndarray, scale: float = 1.0) -> Sim3:
+        stretched = self.poses[f].copy()
+        stretched[:3, 3] *= scale
+        return Sim3.of(scale, world_T_rig @ inverse(stretched))
 
     def _shows_map(self, f: int, inside: np.ndarray, world_T_rig: np.ndarray) -> bool:
         """True unless a frame shows next to nothing of the map around, as at a look-alike poster.
@@ -542,7 +559,7 @@ class _Joining:
         poses[:, :3, 3] += offsets
         scales = np.array([move.scale for move in self.moves])
         moves = np.array([move.new_T_old for move in self.moves])
-        num, alone = int(self.parts.max()) + 1, int(lost.sum())
+        num, alone = int(self.parts.max()) + 1, len(np.unique(self.parts[lost]))
         dropped = {"frames alone": alone, "apart": maps - 1}
         kept = num - maps - alone
         return Registered(

@@ -234,7 +234,7 @@ class TrackedKeyframes:
 
     world_T_keys: np.ndarray  # (K, 4, 4) float64, each in the world of its map
     maps: np.ndarray  # (K,) int32
-    solved: np.ndarray  # (K,) bool, keyframes of maps with points
+    solved: np.ndarray  # (K,) bool, keyframes with features, of maps with points
     distances: np.ndarray  # (K,) float64, median distance of points, map units; positive
     features: Sequence[tuple[np.ndarray, np.ndarray]]  # (K) ids (N,) and bearings (N, 3), rig frame
     pictures: Sequence[np.ndarray]  # (K) JPEG panoramas, (n,) uint8 each

@@ -162,8 +162,9 @@ def measure_steps(
     maps: np.ndarray,
     distances: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Keyframe (K,) int64 that each was tracked from, -1 = the first of its map, and covariances
-    (K, 7, 7) of the steps between both, from common features, as of a `Constraint`.
+    """Keyframe (K,) int64 that each was tracked from, -1 = the first of its map that sees
+    features, and covariances (K, 7, 7) of the steps between both, from common features, as of a
+    `Constraint`.
 
     Rotation and translation: information of the directions to points that the parent observes too.
     Scale: a point propagates it as accurately as the triangulation angle between its first keyframe
@@ -188,7 +189,9 @@ def measure_steps(
     first_seen[known] = found.tracks.frames[first_rows]
     for k in range(num):
         ids, bearings = features[k]
-        before = [j for j in range(max(k - _REACH, 0), k) if maps[j] == maps[k]]
+        before = [
+            j for j in range(max(k - _REACH, 0), k) if maps[j] == maps[k] and len(features[j][0])
+        ]
         if not before:
             continue
         counts = [np.isin(ids, features[j][0], assume_unique=True).sum() for j in before]

@@ -23,7 +23,7 @@ def all_joined(
     ones are joined further as one map. Where frames on both sides share little, as on either side
     of a doorway, a join further inside one of the maps is tried."""
     maps, made = list(maps), list[tuple[TourMap, TourMap, Join]]()
-    known = dict[tuple[int, ...], Join | None]()
+    known = dict[tuple[int, ...], tuple[Join | None, tuple[float, float]]]()
 
     def decide(pairs: Sequence[tuple[TourMap, TourMap]]) -> list[Join | None]:
         new = [pair for pair in pairs if _seen(*pair) not in known]
@@ -36,8 +36,9 @@ def all_joined(
 
         found = map_in_threads(sure_join, len(new), num_threads)
         tried = track(found, "joining maps", len(new)) if new else found
-        known.update((_seen(*pair), at) for pair, at in zip(new, tried, strict=True))
-        return [known[_seen(*pair)] for pair in pairs]
+        for pair, at in zip(new, tried, strict=True):
+            known[_seen(*pair)] = at, _lengths_beside(*pair)
+        return [_in_units_of(*pair, *known[_seen(*pair)]) for pair in pairs]
 
     while True:
         pairs = list(pairwise(maps))
@@ -93,6 +94,31 @@ def _seen(one: TourMap, other: TourMap) -> tuple[int, ...]:
     """Frames beside the step between two maps: the first, those next to it, the last."""
     first, last = max(one.first, one.last - NEAR + 1), min(other.last, other.first + NEAR - 1)
     return first, one.last, other.first, last
+
+
+def _lengths_beside(one: TourMap, other: TourMap) -> tuple[float, float]:
+    """Lengths of the steps before and after the one between two maps, in units of either; a single
+    frame has those of the other map."""
+    before, after = (
+        1.0 if some.single else float(np.linalg.norm(some.between(f, f + 1)[:3, 3]))
+        for some, f in ((one, one.last - 1), (other, other.first))
+    )
+    return after if one.single else before, before if other.single else after
+
+
+def _in_units_of(
+    one: TourMap, other: TourMap, at: Join | None, before: tuple[float, float]
+) -> Join | None:
+    """A join found where the steps beside it had lengths `before`, in the units of the maps, which
+    change where a map before the first one is joined to it."""
+    if at is None:
+        return None
+    by = [now / then for now, then in zip(_lengths_beside(one, other), before, strict=True)]
+    places = [
+        replace(some, depths=some.depths * by[int(some.f >= other.first)]) for some in at.places
+    ]
+    log_scale = at.log_scale + float(np.log(by[0]) - np.log(by[1]))
+    return Join(scaled(at.g_T_f, by[0]), log_scale, at.score, places)
 
 
 def _parts(one: TourMap, other: TourMap, cuts: Sequence[int]) -> list[tuple[TourMap, TourMap]]:

@@ -232,7 +232,7 @@ class Odometry:
         """Summary of the odometry in one line for the terminal."""
         told = self.report()
         line = f"{told['posed']} of {told['frames']} frames posed, {told['keyframes']} keyframes"
-        if not (self.statuses == FrameStatus.TRACKED).any():
+        if told["posed"] and not (self.statuses == FrameStatus.TRACKED).any():
             line += ", rotations only: the camera did not move enough to tell where it went"
         for count, name in ((len(self.loops), "loop"), (len(self.joins), "map")):
             if count:
@@ -289,12 +289,14 @@ def _tracked_keyframes(tracked: Tracking, panoramas: SmallPanoramas) -> TrackedK
     maps = numbers[frames].astype(np.int32)
     known = np.isfinite(distances)
     with_points = np.unique(numbers[(statuses == FrameStatus.TRACKED) & known])
+    # dark frames before the first map have a keyframe without features
+    seen = np.array([len(ids) > 0 for ids, _ in state.keyframe_features])
     if len(with_points):
         distances = np.interp(np.arange(len(distances)), np.flatnonzero(known), distances[known])
     return TrackedKeyframes(
         np.array(state.keyframe_poses),
         maps,
-        np.isin(maps, with_points),
+        np.isin(maps, with_points) & seen,
         distances[frames],
         state.keyframe_features,
         tracked.pictures,
@@ -327,7 +329,7 @@ def _odometry(
     maps[rows] = [joined.get(record.map_number, record.map_number) for record in records]
     keyframes, distances, inliers = np.zeros(num, bool), np.full(num, np.nan), np.zeros(num, int)
     of_keys = rows[key_frames]
-    keyframes[of_keys] = True
+    keyframes[of_keys] = [len(ids) > 0 for ids, _ in tracked_keyframes.features]
     distances[rows] = [record.distance for record in records]
     distances[rows] *= closed.scales[keys]
     near = tracked_keyframes.distances[keys] * closed.scales[keys]

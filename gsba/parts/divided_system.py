@@ -171,7 +171,7 @@ class DividedSystem:
         """Blocks of H^-1 at the start, and draws from it; None if singular.
 
         Args:
-            pairs: (Q, 2) nodes that the writer was to tie.
+            pairs: (Q, 2) frames that the writer was to tie.
 
         Returns:
             (N, 6, 6) diagonal blocks, (Q, 6, 6) blocks between the pairs, and vectors (D, N, 6)
@@ -183,7 +183,8 @@ class DividedSystem:
                  for p, num in zip(local, own, strict=True)]  # fmt: skip
         inside = tuple(p[rows] for p, rows in zip(local, asked, strict=True))
         each = self._of_parts(self.start.at.values(range(self.num_frames)))
-        job = Linearize(self._folder, self._all, self._version, each, self._loss, inside)
+        tied = tuple(pairs[rows] for rows in asked)
+        job = Linearize(self._folder, self._all, self._version, each, self._loss, tied)
         self._linearized = self._results(job)
         if self._factorized(0.0) is None:
             return None

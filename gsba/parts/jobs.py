@@ -94,8 +94,8 @@ class Linearize(_PartJob):
 
     at: tuple[At, ...]  # each part's variables
     loss: RobustLoss
-    pairs: tuple[np.ndarray, ...] = ()  # (Q, 2) int64, places of frames among each part's keys,
-    # that its pattern pairs as well; () = none
+    pairs: tuple[np.ndarray, ...] = ()  # (Q, 2) int64, frames of each part that its pattern pairs
+    # as well; () = none
 
     title = "linearizing"
     returns: Any = Linearized
@@ -107,7 +107,7 @@ class Linearize(_PartJob):
             points = load(self._file(item, "points", self.version), PartPoints).points_world
         block, graph = _block(part, points, self.loss), deserialized(part.graph)
         values = self.at[item].values(part.frames)
-        pairs = part.keys[self.pairs[item]].tolist() if self.pairs else ()
+        pairs = [(X(f), X(g)) for f, g in self.pairs[item].tolist()] if self.pairs else ()
         linearized, equations = _linearized(part, block, graph, values, pairs)
         save_record(self._file(item, "equations", self.version), equations, {})
         points = PartPoints(block.points_world, block.point_costs)

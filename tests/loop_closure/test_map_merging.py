@@ -157,6 +157,20 @@ def test_pairs_over_a_pause_join_what_the_surroundings_confirm(
         assert _errors(found)[0] < 0.05
 
 
+def test_a_pause_is_one_among_the_intervals_of_its_recording(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Stills that lie between two videos have longer intervals than most frames."""
+    context, whole, late = scene()
+    monkeypatch.setattr(map_merging._Joining, "_meetings", lambda *_: [])
+    owners = np.digitize(np.arange(NUM), [HALF - 6, HALF + 6])
+    intervals = np.where(owners == 1, 1.0, 0.1)
+    intervals[np.diff(owners, prepend=0) > 0] = 100.0
+    given = torn(whole, late, SCALE, MOVE), _halves(), NOBODY, ~BREAK, np.cumsum(intervals)
+    found = map_merging.merge(context, *given, recordings=owners)
+    assert not found.components.any() and _errors(found)[0] < 0.05
+
+
 @pytest.mark.parametrize(
     ("what", "joined"), [("walks on", True), ("missing", False), ("carried", False)]
 )
@@ -359,6 +373,82 @@ def test_frames_alone_are_registered_against_the_map() -> None:
     assert not found.lost.any() and not found.components.any()
 
 
+def _registered_alone(
+    frames: tuple[int, ...], only: int, seen: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> Registered:
+    """A map and a part of some frames without points, in a world of its own, of which one can be
+    registered."""
+    context, whole, _ = scene()
+    whole = _without_map(whole, frames)
+    whole.world_T_rigs[list(frames)] = MOVE @ TRUTH[list(frames)]
+    register, numbers = map_merging._Joining._register, np.arange(NUM)
+
+    def registered(self, f: int, inside: np.ndarray) -> bool:
+        return f == only and register(self, f, inside)
+
+    monkeypatch.setattr(map_merging._Joining, "_register", registered)
+    parts_of = np.isin(numbers, frames).astype(int)
+    return map_merging.merge(context, whole, parts_of, NOBODY, seen, TIMES)
+
+
+def test_a_frame_goes_where_the_registered_one_that_it_is_tied_to_has_moved(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The first of two is registered once: again, it would no longer move."""
+    found = _registered_alone((13, 14), 13, np.arange(NUM - 1) == 13, monkeypatch)
+    np.testing.assert_array_equal(np.flatnonzero(found.alone), [13])
+    assert not found.lost.any() and not found.components.any()
+    off, turned = _errors(found)
+    assert off < 0.02 and turned < 0.2
+    np.testing.assert_allclose(found.moves[13], inverse(MOVE), atol=0.02)
+
+
+def test_what_is_left_of_a_part_does_not_take_its_registered_frame_along(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    found = _registered_alone((12, 13, 14, 15), 12, NOBODY, monkeypatch)
+    np.testing.assert_array_equal(np.flatnonzero(found.alone), [12])
+    np.testing.assert_array_equal(np.flatnonzero(found.components), [13, 14, 15])
+    poses = found.solved.world_T_rigs
+    np.testing.assert_allclose(poses[12], TRUTH[12], atol=0.02)
+    steps = inverse(poses[13]) @ poses[[14, 15]]
+    np.testing.assert_allclose(steps, inverse(TRUTH[13]) @ TRUTH[[14, 15]], atol=1e-9)
+
+
+@pytest.mark.parametrize("scale", [0.5, 2.0])
+def test_two_frames_with_points_in_a_unit_of_their_own_are_registered(scale: float) -> None:
+    """Points of the first one do not lead the second astray, and come to where they are."""
+    context, whole, _ = scene()
+    alone, tracks, places = (13, 14), whole.landmarks.tracks, whole.landmarks.points_world
+    own = np.isin(tracks.frames, alone)
+    first, second = (tracks.points[tracks.frames == f] for f in alone)
+    shared = np.intersect1d(first, second)
+    kept = ~own | np.isin(tracks.points, shared)
+    points = tracks.points[kept] + len(places) * own[kept]
+    order = np.lexsort((tracks.frames[kept], points))
+    used, points = np.unique(points[order], return_inverse=True)
+    seen = Tracks(
+        points.astype(np.int32),
+        tracks.frames[kept][order],
+        tracks.keypoints[kept][order],
+        len(used),
+    )
+    move = Sim3.of(scale, MOVE)
+    landmarks = replace(
+        whole.landmarks, points_world=np.vstack([places, move.points(places)])[used], tracks=seen
+    )
+    poses = TRUTH.copy()
+    poses[list(alone)] = move.poses(poses[list(alone)])
+    pair = replace(whole, world_T_rigs=poses, landmarks=landmarks)
+    parts_of = np.isin(np.arange(NUM), alone).astype(int)
+    found = map_merging.merge(context, pair, parts_of, NOBODY, NOBODY, TIMES)
+    np.testing.assert_array_equal(np.flatnonzero(found.alone), alone)
+    assert not found.lost.any() and max(_errors(found)) < 0.2
+    np.testing.assert_allclose(found.scales[list(alone)], 1 / scale, rtol=0.005)
+    off = found.solved.landmarks.points_world - places[used % len(places)]
+    assert np.median(np.linalg.norm(off[used >= len(places)], axis=1)) < 0.02
+
+
 def test_a_single_frame_does_not_join_two_recordings() -> None:
     """A frame is registered where its recording has frames, and nowhere else."""
     context, whole, _ = scene()
@@ -384,6 +474,9 @@ def test_a_frame_of_elsewhere_stays_where_its_steps_have_it_or_is_not_registered
     np.testing.assert_array_equal(np.flatnonzero(found.lost), [30])
     np.testing.assert_array_equal(found.components, parts_of)  # apart: a guess is not exported
     assert not found.alone.any() and found.counts.dropped == {"frames alone": 1, "apart": 0}
+    pair = context, given[1], np.isin(np.arange(NUM), (30, 31)).astype(int), NOBODY
+    counts = map_merging.merge(*pair, NOBODY, TIMES).counts
+    assert (counts.received, counts.kept) == (1, 0)  # a part is one, whatever its frames
     by_steps = map_merging.merge(*given, ~NOBODY, TIMES)
     assert not by_steps.lost.any() and not by_steps.components.any()
 

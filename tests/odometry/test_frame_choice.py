@@ -126,3 +126,9 @@ def test_a_camera_that_only_turned_has_its_rotations() -> None:
     found = _odometry(np.zeros((30, 3)), statuses=statuses, distances=np.nan)
     assert found.posed().all() and not found.usable()
     assert "rotations only" in found.summary()
+
+
+def test_frames_without_a_pose_have_no_rotations_either() -> None:
+    statuses = np.full(30, FrameStatus.LOST, np.uint8)
+    line = _odometry(np.zeros((30, 3)), statuses=statuses, distances=np.nan).summary()
+    assert line.startswith("0 of 30 frames posed, 0 keyframes, ") and "rotations" not in line

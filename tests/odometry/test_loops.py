@@ -130,3 +130,15 @@ def test_maps_that_share_a_poster_stay_apart(walk: RenderedWalk) -> None:
     np.testing.assert_array_equal(second.world_T_rigs[0], np.eye(4))
     assert first.timestamps[-1] < second.timestamps[0]
     assert "2 maps that nothing ties together" in found.summary()
+
+
+def test_a_dark_beginning_leaves_the_covariances_as_they_are(walk: RenderedWalk) -> None:
+    """They are relative to the first keyframe that shows something."""
+    frames = walk.frames[:24]
+    late = _followed([*_dark(frames[:2], range(2)), *frames])
+    found, expected = late.covariances, _followed(frames).covariances
+    assert found is not None and expected is not None
+    assert not late.posed()[:2].any() and not late.keyframes[:2].any()
+    assert np.isnan(found[:2]).all()
+    ratios = np.einsum("fii->fi", found[2:]) / np.einsum("fii->fi", expected)
+    assert ratios.min() > 0.5 and ratios.max() < 2.0

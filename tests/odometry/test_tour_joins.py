@@ -1,12 +1,23 @@
 """Maps of a tour, joined across a step that no three frames confirm."""
 
+from dataclasses import dataclass, field
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from gsba.geometry import inverse, pose, unit
 from gsba.odometry import tour_joins, tour_merging
-from gsba.odometry.tour_joins import MIN_LEAD, MIN_SCORE, Join, TourMap, is_sure, join, scaled
+from gsba.odometry.tour_joins import (
+    MIN_LEAD,
+    MIN_SCORE,
+    Join,
+    Places,
+    TourMap,
+    is_sure,
+    join,
+    scaled,
+)
 from gsba.odometry.tour_merging import all_joined, held
 from gsba.odometry.tour_steps import agreed_logs, pose_errors_deg
 from tests.room_tour import frames, still, true_poses, true_step
@@ -25,6 +36,49 @@ def _two_hypotheses(monkeypatch: pytest.MonkeyPatch) -> None:
     ]
     ranked = [(1.0, one) for one in found]
     monkeypatch.setattr(tour_joins, "rough_poses", lambda one, other: ranked)
+
+
+@dataclass(frozen=True)
+class RowOfMaps:
+    """Three maps of three frames each, in units of their own, and joins of them that are known."""
+
+    poses: np.ndarray  # (9, 4, 4) f_T_world
+    scores: dict[tuple[int, int], float] = field(default_factory=dict)  # by the frames that meet
+
+    def true(self, f: int, g: int, unit_length: float) -> np.ndarray:
+        """Pose g_T_f (4, 4) in units of a length."""
+        return scaled(self.poses[g] @ inverse(self.poses[f]), 1 / unit_length)
+
+    def unit_of(self, some: TourMap) -> float:
+        """Length of a map's unit."""
+        f = some.first
+        step = np.linalg.norm(self.true(f, f + 1, 1.0)[:3, 3])
+        return float(step / np.linalg.norm(some.between(f, f + 1)[:3, 3]))
+
+    def join(self, frames: object, one: TourMap, other: TourMap) -> tuple[Join | None, float]:
+        """The true join, with a place one unit of length away in either map."""
+        score = self.scores.get((one.last, other.first))
+        units = self.unit_of(one), self.unit_of(other)
+        if score is None:
+            return None, 0.0
+        ends = (one.last, other.first), (other.first, one.last)
+        none, true = np.zeros((1, 3)), self.true(one.last, other.first, units[0])
+        places = [
+            Places(f, g, np.zeros(1, int), none, np.array([1 / unit]), none, np.ones(1, bool))
+            for (f, g), unit in zip(ends, units, strict=True)
+        ]
+        return Join(true, float(np.log(units[1] / units[0])), score, places), 0.0
+
+    def maps(self) -> list[TourMap]:
+        """The maps, of units 1, 2 and 0.5."""
+        return [
+            TourMap(
+                first,
+                np.array([self.true(first, first + n, size) for n in range(3)]),
+                [np.zeros(0)] * 3,
+            )
+            for first, size in ((0, 1.0), (3, 2.0), (6, 0.5))
+        ]
 
 
 def true_map(room: int, first: int) -> TourMap:
@@ -85,37 +139,19 @@ def test_lengths_are_proposed_by_keys_that_agree() -> None:
     assert agreed_logs(logs[-2:], cells[-2:], 0.15, 2) == []
 
 
-def test_maps_that_share_little_at_a_door_are_joined_further_inside(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+@pytest.fixture
+def row_of_maps(monkeypatch: pytest.MonkeyPatch) -> RowOfMaps:
     rng = np.random.default_rng(0)
     turns = Rotation.from_rotvec(0.3 * rng.normal(size=(9, 3))).as_matrix()
-    poses = inverse(pose(turns, rng.normal(size=(9, 3))))  # f_T_world
-    scores = {(5, 6): 40.0, (2, 6): 60.0}
+    row = RowOfMaps(inverse(pose(turns, rng.normal(size=(9, 3)))))
+    monkeypatch.setattr(tour_merging, "join", row.join)
+    return row
 
-    def true(f: int, g: int, unit_length: float) -> np.ndarray:
-        return scaled(poses[g] @ inverse(poses[f]), 1 / unit_length)
 
-    def unit_of(some: TourMap) -> float:
-        first = some.first
-        step = np.linalg.norm(true(first, first + 1, 1.0)[:3, 3])
-        return float(step / np.linalg.norm(some.between(first, first + 1)[:3, 3]))
-
-    def found(frames: object, one: TourMap, other: TourMap) -> tuple[Join | None, float]:
-        score, units = scores.get((one.last, other.first)), (unit_of(one), unit_of(other))
-        if score is None:
-            return None, 0.0
-        return Join(
-            true(one.last, other.first, units[0]), np.log(units[1] / units[0]), score, []
-        ), 0
-
-    monkeypatch.setattr(tour_merging, "join", found)
-    maps = [
-        TourMap(
-            first, np.array([true(first, first + n, size) for n in range(3)]), [np.zeros(0)] * 3
-        )
-        for first, size in ((0, 1.0), (3, 2.0), (6, 0.5))
-    ]
+def test_maps_that_share_little_at_a_door_are_joined_further_inside(row_of_maps: RowOfMaps) -> None:
+    scores, true = row_of_maps.scores, row_of_maps.true
+    scores |= {(5, 6): 40.0, (2, 6): 60.0}
+    maps = row_of_maps.maps()
     inside, door = all_joined([], maps, 1)
     assert (inside[0].last, inside[1].first) == (5, 6)
     one, other, at = door
@@ -124,3 +160,21 @@ def test_maps_that_share_little_at_a_door_are_joined_further_inside(
     assert at.log_scale == pytest.approx(np.log(2.0))
     scores.pop((2, 6))
     assert len(all_joined([], maps, 1)) == 1
+
+
+@pytest.mark.parametrize("first", [(2, 3), (5, 6)])
+def test_joins_have_the_units_of_maps_joined_before(
+    first: tuple[int, int], row_of_maps: RowOfMaps
+) -> None:
+    """A join known since the map before it had units of its own is not taken in these."""
+    row_of_maps.scores.update({(2, 3): 40.0, (5, 6): 40.0})
+    row_of_maps.scores[first] = 60.0
+    joined = all_joined([], row_of_maps.maps(), 1)
+    assert (joined[0][0].last, joined[0][1].first) == first and len(joined) == 2
+    for one, other, at in joined:
+        units = row_of_maps.unit_of(one), row_of_maps.unit_of(other)
+        true = row_of_maps.true(one.last, other.first, units[0])
+        np.testing.assert_allclose(at.g_T_f, true, atol=1e-9)
+        assert np.exp(at.log_scale) == pytest.approx(units[1] / units[0])
+        for some in at.places:
+            assert some.depths == pytest.approx(1 / units[some.f >= other.first])

@@ -74,6 +74,33 @@ def test_parts_give_the_undivided_covariances(most: int, tmp_path: Path) -> None
     assert np.abs(across - correlated).max() < 0.12  # six deviations of 3,000 draws
 
 
+@pytest.mark.parametrize("dim", [6, 7, 14])
+def test_a_part_may_own_a_variable_of_several_nodes(dim: int, tmp_path: Path) -> None:
+    """As the similarity of a small map with GPS: nodes behind it are no rows of the keys."""
+    points, term, rows, graph = town()
+    values, here = values_at(range(NUM), rows), gtsam.Values()
+    here.insert(X(3), values.atPose3(X(3)))
+    for some in (here, values):
+        some.insert(B(1), np.zeros(dim))
+    unit, rng = gtsam.noiseModel.Isotropic.Sigma(3, 0.1), np.random.default_rng(3)
+    by_pose, by_vector = rng.normal(size=(3, 6)), rng.normal(size=(3, dim))
+    linear = gtsam.JacobianFactor(X(3), by_pose, B(1), by_vector, np.zeros(3), unit)
+    graph.add(gtsam.LinearContainerFactor(linear, here))
+    model = gtsam.noiseModel.Isotropic.Sigma(dim, 1.0)
+    graph.add(gtsam.PriorFactorVector(B(1), np.zeros(dim), model))
+    writer = PartsWriter(tmp_path / "map")
+    writer.tie(np.column_stack([np.arange(NUM - 1), np.arange(1, NUM)]))
+    writer.add(points, [term], graph)
+    writer.finish(values, NUM, writer.cut(values, NUM, 15))
+    keys = [X(f) for f in range(NUM)]
+    block = LandmarkBlock(keys, points, [term], LOSS, num_threads=1)
+    expected, joint = marginal_covariances(graph, [block], values, keys)
+    found, between = divided_covariances(tmp_path / "map", Threads(1), LOSS, 2, 1)
+    scale = np.abs(expected).max()
+    np.testing.assert_allclose(found, expected, atol=1e-9 * scale)
+    np.testing.assert_allclose(between.neighbours, joint.neighbours, atol=1e-9 * scale)
+
+
 @pytest.mark.parametrize("most", [15, NUM + 2])
 def test_variables_that_all_share_move_as_undivided(most: int, tmp_path: Path) -> None:
     settings = SolverOptions(relative_tolerance=1e-10, absolute_tolerance=None, loss=LOSS)
