@@ -70,8 +70,8 @@ def held(
     joining, found = Joining(frames, one, other), dict[tuple[int, int], np.ndarray]()
     for some in at.places:
         rows = joining.confirms(at, some)
-        found[some.f, some.g] = np.full((len(frames[some.f].keys), 3), np.nan)
-        found[some.f, some.g][some.rows[rows]] = some.found[rows]
+        nothing = np.full((len(frames[some.f].keys), 3), np.nan)
+        found.setdefault((some.f, some.g), nothing)[some.rows[rows]] = some.found[rows]
     ends = one.last, other.first
     pairs = list[tuple[tuple[int, int], np.ndarray, np.ndarray, np.ndarray]]()
     for f, g in sorted({ends, *((min(pair), max(pair)) for pair in found)}):

@@ -154,14 +154,17 @@ class Odometry:
         """(F,) bool, frames with a pose from images, in a map with points.
 
         If no map has points the camera only rotated: all frames of the largest map count then.
+        Maps with points in fewer than five frames are ignored.
         """
         found = self.statuses != FrameStatus.LOST
         with_points = np.unique(self.maps[self.statuses == FrameStatus.TRACKED])
         counts = np.bincount(self.maps[found], minlength=int(self.maps.max(initial=0)) + 1)
-        if not len(with_points):
-            return found & (self.maps == np.argmax(counts))
-        large = with_points[counts[with_points] >= 5]  # maps with fewer frames are ignored
-        return found & np.isin(self.maps, large)
+        large = with_points[counts[with_points] >= 5]
+        if len(large):
+            return found & np.isin(self.maps, large)
+        found &= ~np.isin(self.maps, with_points)
+        counts[with_points] = 0
+        return found & (self.maps == np.argmax(counts))
 
     def usable(self) -> bool:
         """True if most frames are posed with points, so that the camera's path is known."""
@@ -232,7 +235,7 @@ class Odometry:
         """Summary of the odometry in one line for the terminal."""
         told = self.report()
         line = f"{told['posed']} of {told['frames']} frames posed, {told['keyframes']} keyframes"
-        if told["posed"] and not (self.statuses == FrameStatus.TRACKED).any():
+        if told["posed"] and not (self.statuses[self.posed()] == FrameStatus.TRACKED).any():
             line += ", rotations only: the camera did not move enough to tell where it went"
         for count, name in ((len(self.loops), "loop"), (len(self.joins), "map")):
             if count:

@@ -128,6 +128,14 @@ def test_a_camera_that_only_turned_has_its_rotations() -> None:
     assert "rotations only" in found.summary()
 
 
+def test_a_turn_has_its_rotations_beside_a_map_of_few_frames() -> None:
+    statuses = np.repeat([FrameStatus.TURNING, FrameStatus.TRACKED], [26, 4]).astype(np.uint8)
+    maps = np.repeat([0, 1], [26, 4]).astype(np.int32)
+    found = _odometry(np.zeros((30, 3)), statuses=statuses, maps=maps)
+    assert np.flatnonzero(found.posed()).tolist() == [*range(26)]
+    assert "26 of 30 frames posed" in found.summary() and "rotations only" in found.summary()
+
+
 def test_frames_without_a_pose_have_no_rotations_either() -> None:
     statuses = np.full(30, FrameStatus.LOST, np.uint8)
     line = _odometry(np.zeros((30, 3)), statuses=statuses, distances=np.nan).summary()

@@ -1,6 +1,6 @@
 """Maps of a tour, joined across a step that no three frames confirm."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
@@ -20,6 +20,7 @@ from gsba.odometry.tour_joins import (
 )
 from gsba.odometry.tour_merging import all_joined, held
 from gsba.odometry.tour_steps import agreed_logs, pose_errors_deg
+from gsba.types.records import with_rows
 from tests.room_tour import frames, still, true_poses, true_step
 
 
@@ -101,6 +102,20 @@ def test_maps_of_one_room_are_joined_in_pose_and_scale() -> None:
     for (f, g), f_T_g, found_g, found_f in pairs:
         assert max(pose_errors_deg(f_T_g, inverse(poses[f]) @ poses[g])) < 0.5
         assert len(found_g) == len(some[f].keys) and len(found_f) == len(some[g].keys)
+
+
+def test_all_places_of_two_searches_between_the_same_frames_hold_a_join() -> None:
+    """A search further inside of a map finds places between frames next to the join, too."""
+    some, (one, other) = frames(), (true_map(0, 0), true_map(0, 2))
+    best, _ = join(some, one, other)
+    assert best is not None
+    halves = [
+        with_rows(each, np.arange(n, len(each.rows), 2)) for n in (0, 1) for each in best.places
+    ]
+    twice = held(some, one, other, replace(best, places=halves))
+    for once, again in zip(held(some, one, other, best), twice, strict=True):
+        np.testing.assert_array_equal(once[2], again[2])
+        np.testing.assert_array_equal(once[3], again[3])
 
 
 def test_single_frames_join_the_map_beside_them() -> None:
