@@ -62,16 +62,13 @@ class Readings:
         rates = sensor.true(self.rates)
         onward = 0.5 * (rates[:-1] + rates[1:]) * np.diff(self.timestamps)[:, None]
         num, block = len(onward), max(int(np.sqrt(len(onward))), 1)
-        padded = np.concatenate([onward, np.zeros((-num % block, 3))]).reshape(-1, block, 3)
-        within = [Rotation.from_rotvec(padded[:, 0])]
+        padded = np.concatenate([onward, np.zeros((-num % block, 3))])
+        turned = Rotation.from_rotvec(padded).as_matrix().reshape(-1, block, 3, 3)
         for n in range(1, block):
-            within.append(within[-1] * Rotation.from_rotvec(padded[:, n]))
-        starts = [Rotation.identity()]
-        for end in within[-1]:
-            starts.append(starts[-1] * end)
-        before = np.array([start.as_matrix() for start in starts[:-1]])
-        after = np.stack([one.as_matrix() for one in within], axis=1)
-        turned = (before[:, None] @ after).reshape(-1, 3, 3)[:num]
+            turned[:, n] = turned[:, n - 1] @ turned[:, n]
+        for k in range(1, len(turned)):
+            turned[k] = turned[k - 1, -1] @ turned[k]
+        turned = turned.reshape(-1, 3, 3)[:num]
         return np.concatenate([np.eye(3)[None], turned])
 
     def mean_rates(self, times: np.ndarray, span: float) -> np.ndarray:

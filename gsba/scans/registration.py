@@ -13,7 +13,7 @@ from gsba.geometry import rotation_angle
 from gsba.log import GsbaError
 from gsba.scans.fit import Fit, approach, noise_of, reach_of, settle
 from gsba.scans.judge import CellGrid, ScanVerdict, verdict
-from gsba.scans.search import Guess, candidates, distance
+from gsba.scans.search import Guess, candidates, distances
 from gsba.scans.types import Cloud, Scan
 from gsba.similarity import Sim3
 
@@ -167,7 +167,7 @@ def _aligned(starts: Sequence[Sim3], cloud: Cloud, scan: Scan) -> list[tuple[Sim
     for start in starts:
         # part of the cloud's size
         fit, sigma = approach(start, cloud, scan, 0.08 * cloud.size * start.scale)
-        same = (distance(fit, other, cloud) < _MIN_DISTANCE for other, _ in near)
-        if 1 / _MAX_SCALE_RATIO < fit.scale / start.scale < _MAX_SCALE_RATIO and not any(same):
+        same = distances(fit, [other for other, _ in near], cloud) < _MIN_DISTANCE
+        if 1 / _MAX_SCALE_RATIO < fit.scale / start.scale < _MAX_SCALE_RATIO and not same.any():
             near.append((fit, sigma))
     return near

@@ -1,7 +1,7 @@
 """Candidate placements of a cloud in a scan, by the main axes of their surfaces, along which
 profiles correlate at one scale and shift; all rotations that map axes to axes are tried."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import permutations, product
@@ -60,18 +60,20 @@ def candidates(cloud: Cloud, scan: Scan, guess: Guess, most: int) -> list[Sim3]:
         found = [found[n] for n in np.argsort(-scores, kind="stable")[:300]]
     distinct: list[Sim3] = []
     for fit in found:
-        if all(distance(fit, other, cloud) > _MIN_DISTANCE for other in distinct):
+        if (distances(fit, distinct, cloud) > _MIN_DISTANCE).all():
             distinct.append(fit)
         if len(distinct) == most:
             break
     return distinct
 
 
-def distance(first: Sim3, second: Sim3, cloud: Cloud) -> float:
-    """Distance of two similarities: 90th percentile over the cloud's points, part of its size."""
-    some = _some(cloud.points, 50)
-    apart = np.linalg.norm(first.points(some) - second.points(some), axis=1)
-    return float(np.quantile(apart, 0.9)) / (min(first.scale, second.scale) * cloud.size)
+def distances(fit: Sim3, others: Sequence[Sim3], cloud: Cloud) -> np.ndarray:
+    """Distances (S,) of a similarity from others: 90th percentile over the cloud's points, part of
+    its size."""
+    some, scales = _some(cloud.points, 50), np.array([other.scale for other in others])
+    there = np.array([other.points(some) for other in others]).reshape(-1, len(some), 3)
+    apart = np.quantile(np.linalg.norm(there - fit.points(some), axis=2), 0.9, axis=1)
+    return apart / (np.minimum(scales, fit.scale) * cloud.size)
 
 
 def score(fit: Sim3, cloud: Cloud, scan: Scan, points: int = 400) -> float:

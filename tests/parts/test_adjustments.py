@@ -82,35 +82,43 @@ def context(
     poses: np.ndarray,
     kind: str = "bearing",
     workers: Workers | None = None,
+    most: int = 50,
 ) -> AdjustmentContext:
-    """Context of an adjustment whose maps are divided."""
+    """Context of an adjustment in at most `most` iterations a round, whose maps are divided."""
     factors = ("bearing", "reprojection") if kind == "reprojection" else ("bearing",)
     settings = RefineSettings(factors=factors)
-    solver = SolverOptions(relative_tolerance=1e-9, absolute_tolerance=None)
+    solver = SolverOptions(most, relative_tolerance=1e-9, absolute_tolerance=None)
     workers = Threads(2) if workers is None else workers
     division = DividedAdjustments(folder / "parts", folder / "shards", workers, part_frames)
     return AdjustmentContext(families(poses, kind), RIG, settings, 1, solver, division=division)
 
 
-@pytest.fixture(scope="module")
-def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Solution:
-    """The town adjusted in parts of 15 frames without any mishap."""
+def _adjusted(folder: Path) -> Solution:
+    """The town adjusted in parts of 15 frames, in a few iterations."""
     poses, keypoints, tracks = town_map()
-    here = context(tmp_path_factory.mktemp("undisturbed"), 15, poses)
+    here = context(folder, 15, poses, most=5)
     return adjustment.adjust(tracks, keypoints, Solution.without_points(poses), here, GATES)
 
 
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Solution:
+    """The town adjusted without any mishap."""
+    return _adjusted(tmp_path_factory.mktemp("undisturbed"))
+
+
 @pytest.mark.parametrize("kind", ["bearing", "reprojection"])
-def test_rounds_in_parts_give_the_undivided_solution(
-    kind: str, undisturbed: Solution, tmp_path: Path
-) -> None:
+def test_rounds_in_parts_give_the_undivided_solution(kind: str, tmp_path: Path) -> None:
     poses, keypoints, tracks = town_map()
-    start, parts = Solution.without_points(poses), undisturbed
-    here = context(tmp_path, NUM, poses, kind)
-    whole = adjustment.adjust(tracks, keypoints, start, here, GATES)
-    if kind != "bearing":
-        here = context(tmp_path, 15, poses, kind)
-        parts = adjustment.adjust(tracks, keypoints, start, here, GATES)
+    whole, parts = (
+        adjustment.adjust(
+            tracks,
+            keypoints,
+            Solution.without_points(poses),
+            context(tmp_path, part_frames, poses, kind),
+            GATES,
+        )
+        for part_frames in (NUM, 15)
+    )
     for one, other in zip(parts.rounds, whole.rounds, strict=True):
         assert (one.observations, one.points, one.support) == (
             other.observations,
@@ -134,8 +142,6 @@ def test_rounds_in_parts_give_the_undivided_solution(
 def test_a_stopped_adjustment_goes_on_in_another_call(
     undisturbed: Solution, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    poses, keypoints, tracks = town_map()
-    start, stopped = Solution.without_points(poses), tmp_path / "stopped"
     solve, calls = parts_adjustments.optimize_divided, []
 
     def stop(*args, **options):  # type: ignore[no-untyped-def]
@@ -146,8 +152,8 @@ def test_a_stopped_adjustment_goes_on_in_another_call(
 
     monkeypatch.setattr(parts_adjustments, "optimize_divided", stop)
     with pytest.raises(KeyboardInterrupt):
-        adjustment.adjust(tracks, keypoints, start, context(stopped, 15, poses), GATES)
-    found = adjustment.adjust(tracks, keypoints, start, context(stopped, 15, poses), GATES)
+        _adjusted(tmp_path)
+    found = _adjusted(tmp_path)
     assert len(calls) == 3  # the first round was not solved again
     np.testing.assert_array_equal(found.world_T_rigs, undisturbed.world_T_rigs)
     counts = [[len(one.iterations) for one in each.rounds] for each in (found, undisturbed)]
@@ -158,9 +164,7 @@ def test_a_full_disk_ends_an_adjustment_in_one_line_and_costs_nothing_else(
     undisturbed: Solution, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Twice in one adjustment, the second time after more files."""
-    poses, keypoints, tracks = town_map()
-    start, full, rename = Solution.without_points(poses), tmp_path / "full", os.replace
-    left = 0
+    rename, left = os.replace, 0
 
     def fill(*args: Any, **options: Any) -> None:
         nonlocal left
@@ -173,9 +177,9 @@ def test_a_full_disk_ends_an_adjustment_in_one_line_and_costs_nothing_else(
         with monkeypatch.context() as patched:
             patched.setattr(disk.os, "replace", fill)
             with pytest.raises(FullDiskError) as caught:
-                adjustment.adjust(tracks, keypoints, start, context(full, 15, poses), GATES)
+                _adjusted(tmp_path)
         assert len(str(caught.value).splitlines()) == 1
-    found = adjustment.adjust(tracks, keypoints, start, context(full, 15, poses), GATES)
+    found = _adjusted(tmp_path)
     np.testing.assert_array_equal(found.world_T_rigs, undisturbed.world_T_rigs)
 
 
