@@ -58,7 +58,7 @@ def test_a_place_is_found_though_a_third_is_missing_and_furniture_moved() -> Non
 
 
 def test_chance_has_no_say() -> None:
-    given = cloud(SIZE, HALL, 2, 400), scan(SIZE, MOVED, 2, num=4000), OF_KNOWN_SCALE, 100
+    given = cloud(SIZE, HALL, 2, 400), scan(SIZE, MOVED, 2, num=4000), Guess(), 100
     first = candidates(*given)
     search._rows.cache_clear()  # as in another process
     second = candidates(*given)
