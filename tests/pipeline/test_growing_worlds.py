@@ -26,7 +26,7 @@ from gsba.pipeline.joint_cameras import JointCameras
 from gsba.pipeline.joint_map import JointMaps
 from gsba.pipeline.map import Map
 from gsba.pipeline.prior import Prior
-from gsba.pipeline.run import Run
+from gsba.pipeline.run import Evidence, Run
 from gsba.pipeline.state import State
 from gsba.similarity import Sim3
 from gsba.store.store import RunStore
@@ -88,7 +88,7 @@ def _joined(components: np.ndarray) -> State:
     merged = cast(Any, SimpleNamespace(components=components, reasons=()))
     parts = components if components.any() else None
     prior = replace(Prior.of(start), parts=parts, merged=merged)
-    return State(Run(*given), prior, *[nothing] * 4)
+    return State(replace(Run(*given), evidence=Evidence()), prior, *[nothing] * 4)
 
 
 @pytest.mark.parametrize("joined_to_largest", [True, False])
