@@ -88,3 +88,18 @@ def test_upright_axes_are_rotations_along_what_they_are_given() -> None:
     np.testing.assert_allclose(products, np.tile(np.eye(3), (50, 1, 1)), atol=1e-12)
     np.testing.assert_allclose(np.linalg.det(axes), 1)
     np.testing.assert_allclose(axes[2:, 1, 0], 0, atol=1e-12)  # x is level
+
+
+def test_a_camera_heads_along_its_own_map() -> None:
+    """Every third frame is in no map, and lies far away."""
+    world_T_rigs, maps = loop_walk(12, 1.0), np.zeros(12, np.int64)
+    maps[2::3] = 1 + np.arange(4)
+    apart = world_T_rigs.copy()
+    apart[2::3, 0, 3] += 100
+    ahead = apart[1::3, :3, 3] - apart[0::3, :3, 3]
+    found = lens_axes._headings(apart, maps)
+    for first in (0, 1):  # both frames of a map go along its step
+        local = np.einsum("fji,fj->fi", apart[first::3, :3, :3], ahead)
+        local[:, 1] = 0
+        along = local / np.linalg.norm(local, axis=1, keepdims=True)
+        np.testing.assert_allclose(found[first::3], along, atol=1e-9)
