@@ -156,6 +156,16 @@ def standing_places(centres: np.ndarray, walked: np.ndarray | slice = slice(None
     return places
 
 
+def frames_beside(breaks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Frames (F,) int64 before and after each one; across breaks (F - 1,) bool, and at both ends,
+    it is the frame itself."""
+    num, pauses = len(breaks) + 1, np.flatnonzero(breaks)
+    before, after = np.arange(num) - 1, np.arange(num) + 1
+    first, last = np.append(pauses + 1, 0), np.append(pauses, num - 1)
+    before[first], after[last] = first, last
+    return before, after
+
+
 def furthest(positions: np.ndarray) -> tuple[int, float]:
     """Row of the position, of (N, 3), that is furthest from the first, and its distance."""
     distances = np.linalg.norm(positions - positions[0], axis=1)

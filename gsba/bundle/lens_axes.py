@@ -23,7 +23,7 @@ from gsba.bundle.shared_parameters import (
     validated,
 )
 from gsba.camera.lens import Lenses
-from gsba.geometry import standing_length, unit
+from gsba.geometry import frames_beside, standing_length, unit
 from gsba.types import Counts
 
 logger = logging.getLogger(__name__)
@@ -139,9 +139,8 @@ def _candidates(rays: ObservedRays) -> list[np.ndarray]:
 def _headings(world_T_rigs: np.ndarray, maps: np.ndarray) -> np.ndarray:
     """Level directions (F, 3) in which each rig goes in its map (F,), in its frame; of the nearest
     that does."""
-    num, last = len(world_T_rigs), np.flatnonzero(np.diff(maps))
-    before, after = np.maximum(np.arange(num) - 1, 0), np.minimum(np.arange(num) + 1, num - 1)
-    before[last + 1], after[last] = last + 1, last
+    num = len(world_T_rigs)
+    before, after = frames_beside(maps[1:] != maps[:-1])
     moved = world_T_rigs[after, :3, 3] - world_T_rigs[before, :3, 3]
     lengths = np.linalg.norm(moved, axis=1)
     going = np.flatnonzero(lengths > standing_length(lengths))

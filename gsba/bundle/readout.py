@@ -26,6 +26,7 @@ from gsba.bundle.shared_parameters import (
 from gsba.camera.cameras import Cameras
 from gsba.camera.lens import Lenses, rows_run
 from gsba.config import CameraSettings
+from gsba.geometry import frames_beside
 from gsba.types import Counts, GyroConstraints, Tracks
 
 logger = logging.getLogger(__name__)
@@ -214,15 +215,11 @@ def velocities(
     are 0 where no gyro knows them. Nothing is known of motion across a pause, such as that from one
     recording to the next, nor from one map to another, whose worlds nothing relates.
     """
-    num = len(timestamps)
-    before, after = np.arange(num) - 1, np.arange(num) + 1
     intervals = np.diff(timestamps)
     breaks = intervals > 50.0 * np.median(intervals)
     if maps is not None:
         breaks |= maps[1:] != maps[:-1]
-    pauses = np.flatnonzero(breaks)
-    first, last = np.append(pauses + 1, 0), np.append(pauses, num - 1)
-    before[first], after[last] = first, last
+    before, after = frames_beside(breaks)
     span = np.maximum(timestamps[after] - timestamps[before], intervals.min())[:, None]
     moved = world_T_rigs[after, :3, 3] - world_T_rigs[before, :3, 3]
     local = np.einsum("fji,fj->fi", world_T_rigs[:, :3, :3], moved)
